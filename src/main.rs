@@ -138,7 +138,7 @@ enum Command {
     #[cfg(feature = "lab")]
     /// Train an adapter on the features of one or more rooms and publish it
     Train(train::Train),
-    /// Fit an adapter to one room, cross-validate its pose errors there, and publish it
+    /// Fit an adapter to one room, measure its errors by cross-validation, and publish it
     Fit(fit::Fit),
     #[cfg(feature = "lab")]
     /// Score navigators on held-out motions: Hit@ε with baselines and intervals

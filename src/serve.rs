@@ -101,13 +101,15 @@ pub struct Serve {
     /// Maximum size of an image, 1 to 1000000000 pixels after decoding
     #[arg(long, env = "SEESE3_MAX_IMAGE_PIXELS", default_value_t = 16_000_000, value_parser = clap::value_parser!(u64).range(1..=1_000_000_000))]
     max_image_pixels: u64,
-    /// Maximum number of steps in one navigation
+    /// Maximum number of steps in one navigation; requests beyond it are refused
     #[arg(long, env = "SEESE3_MAX_STEPS", default_value_t = Limits::default().steps, value_parser = clap::value_parser!(u32).range(1..))]
     max_steps: u32,
-    /// Maximum number of frames returned for one step or one localization
+    /// Maximum number of frames returned for one step or one localization; requests beyond it are
+    /// refused
     #[arg(long, env = "SEESE3_MAX_TOP_K", default_value_t = Limits::default().top_k, value_parser = clap::value_parser!(u32).range(1..))]
     max_top_k: u32,
-    /// Maximum number of frames in one answer (steps times frames per step)
+    /// Maximum number of frames in one answer (steps times frames per step); requests beyond it are
+    /// refused
     #[arg(long, env = "SEESE3_MAX_FRAMES_IN_ANSWER", default_value_t = Limits::default().frames_in_answer, value_parser = clap::value_parser!(u64).range(1..))]
     max_frames_in_answer: u64,
     /// Memory limit of all requests in progress, 16777216 to 1099511627776 bytes: received data,
@@ -129,19 +131,21 @@ pub struct Serve {
     /// image
     #[arg(long, env = "SEESE3_MAX_MESSAGE_BYTES", default_value_t = Config::default().message_bytes, value_parser = bounded(1_024, 1 << 30))]
     max_message_bytes: usize,
-    /// Time limit of a request, seconds, 1 to 86400, regardless of the client's deadline
+    /// Time limit of a request, seconds, 1 to 86400; a client's deadline can only shorten it. An
+    /// open tracking stream has no time limit
     #[arg(long, env = "SEESE3_MAX_REQUEST_SECONDS", default_value_t = Config::default().longest.as_secs(), value_parser = clap::value_parser!(u64).range(1..=86_400))]
     max_request_seconds: u64,
     /// Lame-duck time, seconds, 0 to 86400: after SIGTERM or Ctrl-C, requests are still accepted
     /// while health reports NOT_SERVING, so that load balancers notice first
     #[arg(long, env = "SEESE3_LAME_DUCK_SECONDS", default_value_t = Config::default().lame_duck.as_secs(), value_parser = clap::value_parser!(u64).range(0..=86_400))]
     lame_duck_seconds: u64,
-    /// Time for running requests to finish after that, seconds, 0 to 86400
+    /// Drain time, seconds, 0 to 86400: after the lame-duck time, running requests may finish for
+    /// this long
     #[arg(long, env = "SEESE3_DRAIN_SECONDS", default_value_t = Config::default().drain.as_secs(), value_parser = clap::value_parser!(u64).range(0..=86_400))]
     drain_seconds: u64,
     /// Interval at which the store is checked for new revisions, seconds, 0 to 86400; they are
-    /// served without a restart. With 0, only SIGHUP triggers a check. SIGHUP also retries what was
-    /// refused
+    /// served without a restart. With 0, only SIGHUP triggers a check. SIGHUP also retries the
+    /// revisions that were refused
     #[arg(long, env = "SEESE3_RELOAD_SECONDS", default_value_t = Config::default().reload.every.map_or(0, |every| every.as_secs()), value_parser = clap::value_parser!(u64).range(0..=86_400))]
     reload_seconds: u64,
     /// Maximum number of concurrent tracking streams, 1 to 1000000; further ones are refused
@@ -152,13 +156,13 @@ pub struct Serve {
     /// and tokens are invalid after the server stops
     #[arg(long, value_name = "FILE", env = "SEESE3_TOKEN_KEY_FILE")]
     token_key_file: Option<PathBuf>,
-    /// Number of threads for short requests, and as many for requests with images; batches and
-    /// evaluations get half as many, rounded up. Also the number of threads of an onnxruntime
-    /// session. 1 to 1024; the number of cores if omitted
+    /// Threads of each of three pools, 1 to 1024: short requests, requests with images, and batches,
+    /// evaluations and fits, which get half as many, rounded up. Also the number of threads of an
+    /// onnxruntime session. The number of cores if omitted
     #[arg(long, env = "SEESE3_THREADS", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
-    /// Maximum number of requests of each of these kinds that wait for a thread, 0 to 1000000;
-    /// further ones are refused
+    /// Maximum number of waiting requests in each thread pool (see --threads), 0 to 1000000; further
+    /// ones are refused
     #[arg(long, env = "SEESE3_QUEUE", default_value_t = Config::default().queue, value_parser = bounded(0, 1_000_000))]
     queue: usize,
     /// Format of the log, which goes to standard error; RUST_LOG filters it

@@ -40,16 +40,16 @@ pub struct Train {
     #[arg(long, value_delimiter = ',')]
     correctors: Vec<String>,
     /// Calibration rooms, in which the adapter's errors are measured: names, or patterns with *;
-    /// none may be a training room. One is enough for +calibrated navigators; tracking and
-    /// relocalization need two or more
+    /// none may be a training room. One is enough for navigators whose name ends in +calibrated;
+    /// tracking and relocalization need two or more
     #[arg(long)]
     calibrate_on: Vec<String>,
     /// Seed of initial weights, drawn pairs and their order, 0 to 2³² − 1; weights and order are
     /// those of PyTorch's generator
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
     seed: u64,
-    /// Number of adapters to train, with seeds --seed, --seed + 1, …, 1 to 1000: mean and deviation
-    /// of the scores are reported, the first adapter is published
+    /// Number of adapters to train, 1 to 1000, with the seeds --seed, --seed + 1, …: mean and
+    /// deviation of the scores are reported, the first adapter is published
     #[arg(long, default_value_t = 1)]
     seeds: u64,
     /// Name of the adapter in the store; derived from the rooms, features and protocol if omitted

@@ -26,23 +26,24 @@ pub struct Destination {
     /// (feature `cloud`)
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
-    /// Name of the room in the store; derived from the path if omitted
+    /// Name of the room in the store; if omitted, the name in an exported bundle, else derived from
+    /// the path
     #[arg(long, visible_alias = "room")]
     pub name: Option<String>,
     /// Keep every K-th usable frame of each sequence
     #[arg(long, value_name = "K", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
-    /// Fail and publish nothing, instead of dropping frames and warning, if a frame is unusable or
-    /// the poses are wrong: contradicted by the images, all identical, identities from lost
-    /// tracking, steps too long for meters, or timestamps that do not increase
+    /// Fail and publish nothing, instead of warning. Reasons: an unusable frame; an unreadable image;
+    /// wrong poses (contradicted by the images, all identical, identities from lost tracking, steps
+    /// too long for meters, timestamps that do not increase)
     #[arg(long)]
     strict: bool,
     /// Publish a new revision even if the store has a room of this name with other frames; the
     /// features of the old frames are not carried over
     #[arg(long)]
     replace: bool,
-    /// Features of all usable frames, NAME=FILE.npy, shape (n, d), one row per frame before
-    /// --every; may be given several times
+    /// Features, NAME=FILE.npy, shape (n, d): one row for each usable frame, also for those that
+    /// --every leaves out; may be given several times
     #[arg(long = "features", value_name = "NAME=FILE")]
     features: Vec<String>,
     /// License of the recording, stored with the room
@@ -245,7 +246,7 @@ impl Destination {
         frames.poses = read.collect();
         let room = self.room(format, path, &recording, frames)?;
 
-        // The last checks come before the first write: a failed import leaves the store unchanged.
+        // The last checks come before the first write: a failed import publishes nothing.
         check_features(&room, &features)?;
         let store = Store::create(&self.store)?;
         self.refuse_other_frames(&store, &room).await?;

@@ -77,7 +77,7 @@
 //! | [`trajectory`] | trajectory evaluation: association, alignment, APE, RPE |
 //! | [`adapter`] | features to latents, latents to motions and back; networks and their training |
 //! | [`training`] | trains and scores an adapter on rooms |
-//! | [`navigation`] | retrieves the frames after a motion |
+//! | [`navigation`] | retrieves the frames that a camera would see after a motion |
 //! | [`localization`] | retrieves the frames most similar to a view |
 //! | [`eval`] | Hit@ε on held-out motions, and data-leak checks |
 //!

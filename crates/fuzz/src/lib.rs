@@ -1,1 +1,1 @@
-//! Mutated files for every parser of outside bytes: `cargo test -p seese3-fuzz`. `tests/mutations.rs` has the targets.
+//! Tests every parser of untrusted input with mutated files: `cargo test -p seese3-fuzz`. `tests/mutations.rs` has the targets.

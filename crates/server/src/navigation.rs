@@ -81,7 +81,7 @@ fn check_batch(requests: &[pb::NavigateRequest], most: usize, limits: Limits) ->
     // batch.
     let in_all = requests
         .iter()
-        .map(hits_asked_for)
+        .map(frames_requested)
         .fold(0, u64::saturating_add);
 
     if in_all > limits.frames_in_answer {
@@ -123,7 +123,7 @@ fn answer_batch(
 
 /// Number of frames that a request asks for: motions × steps × top_k. Used only for the batch
 /// limit; each request is validated when it is answered.
-fn hits_asked_for(request: &pb::NavigateRequest) -> u64 {
+fn frames_requested(request: &pb::NavigateRequest) -> u64 {
     let motions = match request
         .displacement
         .as_ref()

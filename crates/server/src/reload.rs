@@ -43,7 +43,7 @@ impl ReloadHandle {
         (Self(sender), receiver)
     }
 
-    /// Completes after a reload that began after this call, or when the server stops.
+    /// Completes after the next attempt to reload, also a failed one, or when the server stops.
     pub async fn now(&self) {
         let (done, checked) = oneshot::channel();
         if self.0.send(done).is_ok() {

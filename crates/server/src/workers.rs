@@ -23,7 +23,7 @@ pub enum Lane {
     Short,
     /// Requests with images to decode and encode.
     Images,
-    /// Batches and evaluations.
+    /// Batches, evaluations and fits.
     Long,
 }
 
@@ -158,8 +158,8 @@ impl Workers {
         result.unwrap_or(Err(Error::Deadline))?
     }
 
-    /// Runs a short piece of a stream's work on a blocking thread. The stream was admitted when it
-    /// was opened, so its work waits for a thread without limit and is never refused.
+    /// Runs work on a blocking thread that was admitted elsewhere: a frame of a stream, an image of
+    /// an upload, a fit. It waits for a thread without limit, is never refused, and is not cancelled.
     ///
     /// # Errors
     /// [`Error::Loading`] if the stopping server abandoned the work, [`Error::Internal`] if it
@@ -169,7 +169,7 @@ impl Workers {
         lane: Lane,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<T, Error> {
-        // Short work is not cancelled; dropping the future only discards its result.
+        // Dropping the future only discards the result.
         self.on_thread(lane, work).await
     }
 

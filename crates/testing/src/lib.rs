@@ -1,4 +1,4 @@
-//! Test support: oracle files and synthetic rooms.
+//! Test support: files of expected results, and synthetic rooms.
 #![allow(
     missing_docs,
     clippy::unwrap_used,

@@ -31,7 +31,8 @@ pub struct TrainingRecord {
     pub room_tests: Vec<MotionScores>,
     /// Scores on the training pairs.
     pub train: MotionScores,
-    /// R² on the test pairs of a constant prediction, the mean training twist; mean over rooms.
+    /// Baseline: R² on the test pairs if μ is predicted for every pair; mean over rooms. A fitted
+    /// adapter has no test pairs; there the training pairs are used.
     pub train_mean_r2: f64,
 }
 

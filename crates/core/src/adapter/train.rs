@@ -41,8 +41,8 @@ pub struct TrainConfig {
     /// Standard deviation of the Gaussian noise added to the features at every step. The unit is
     /// that of the features after z-scoring, if `standardise` is set.
     pub noise: f64,
-    /// Decay of the exponential moving average of the weights, which replaces the last weights; 0
-    /// for no averaging.
+    /// Decay of the exponential moving average of the weights, which is the result of the training;
+    /// at 0, the last weights are.
     pub average: f64,
     /// Whether targets are scaled with μ = 0 and σ = root mean square. Zero motion then leaves the
     /// latent unchanged in every reading.
@@ -143,7 +143,7 @@ pub struct EpochProgress {
     pub done: usize,
     /// Number of epochs in the whole run.
     pub epochs: usize,
-    /// Mean loss of the epoch.
+    /// Mean of the batch losses of the epoch.
     pub loss: f64,
 }
 
@@ -266,8 +266,8 @@ pub fn train(
     Mixture::even(charts)
 }
 
-/// Continues the training of a single-chart network; the targets of `samples` must have the
-/// network's scale. Widths and charts of `config` are ignored; the seed sets the sample order and
+/// Continues the training of a single-chart network; `samples` must be scaled
+/// with the μ and σ that the network was trained with. Widths and charts of `config` are ignored; the seed sets the sample order and
 /// the noise.
 ///
 /// # Errors

@@ -13,7 +13,7 @@ use super::{
 use crate::features::FeatureSource;
 use crate::geometry::Twist;
 
-/// Rows embedded at a time, so that memory use does not grow with the room.
+/// Rows embedded at a time, which bounds the memory of intermediate results.
 const EMBED_ROWS: usize = 1_024;
 /// Tolerance of the gate weights: of their sum from 1, and of each weight of an ensemble from 1/K.
 const GATE_TOLERANCE: f64 = 1e-6;
@@ -204,8 +204,8 @@ impl Adapter {
             .collect()
     }
 
-    /// σ ⊙ W, shape (6, [`Adapter::coordinate_count`]): maps a difference of latents to the motion
-    /// without μ. For an ensemble it is σ ⊙ W̄.
+    /// σ ⊙ W, shape (6, [`Adapter::coordinate_count`]): a motion is this matrix times the
+    /// difference of two latents, plus μ. For an ensemble it is σ ⊙ W̄.
     ///
     /// # Errors
     /// [`Error::GatedMotion`] for charts with a gate: their matrix depends on the source frame.
@@ -344,8 +344,8 @@ impl Adapter {
 
     /// The latent step of a motion from `latent` by a corrector. A residual corrector adds its
     /// output to W⁺ΔP in the affine reading; the linear one predicts the target latent, and the
-    /// source latent is subtracted. Each part of a longer motion is treated as a whole motion,
-    /// because μ is part of the corrector's input and cannot be divided among parts.
+    /// source latent is subtracted. If a motion is divided into parts, call this for each part: each gets
+    /// the whole μ, because μ is part of the corrector's input and cannot be divided.
     ///
     /// # Errors
     /// [`Error::NoCorrector`] when the adapter has no corrector of this kind.

@@ -296,21 +296,21 @@ impl Navigator {
         let mut from = start.clone();
         let mut wanted = start.pose;
 
-        // Each motion is one leg. A leg starts at the end of the previous one, but its goal is
-        // relative to the previous goal, so that a closed loop corrects the error of earlier legs.
+        // Each motion is one leg. A leg starts where the previous leg arrived. Its goal is computed
+        // from the previous leg's goal, so that a closed loop corrects the error of earlier legs.
         for twist in twists {
-            let begun_at = wanted;
+            let previous_goal = wanted;
             let leg = Leg {
                 motion: twist,
-                goal: begun_at.map(|pose| pose * exp(&twist)),
+                goal: previous_goal.map(|pose| pose * exp(&twist)),
             };
             let walked = walk(space, &from, leg, plan, cancel)?;
 
             for (done, step) in (1usize..).zip(walked) {
-                // The requested pose after step n of S is begun_at · exp(n ξ / S), with ξ the
+                // The requested pose after step n of S is previous_goal · exp(n ξ / S), with ξ the
                 // motion.
                 let walked_so_far = twist.times(done).divided(query.steps);
-                wanted = begun_at.map(|pose| pose * exp(&walked_so_far));
+                wanted = previous_goal.map(|pose| pose * exp(&walked_so_far));
 
                 from = query
                     .mode

@@ -1,8 +1,9 @@
 //! Readers for recordings on disk.
 //!
-//! Whatever the convention of a recording, the poses returned here are `world_from_camera`, in
-//! metres, with rotations on SO(3), and the frames are in order of capture. Every format has a file
-//! of its own; `collect` holds what they share.
+//! Readers convert from the convention that a format defines to `world_from_camera`, meters,
+//! rotations on SO(3), with frames in order of capture. A recording that deviates from its format's
+//! convention is not noticed here; `import` applies `--poses`, `--convention` and `--scale` afterwards.
+//! Each format has a file or folder of its own; `collect` and `text` hold what most of them share.
 
 mod arkitscenes;
 #[cfg(feature = "bags")]

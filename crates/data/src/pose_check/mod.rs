@@ -1,6 +1,6 @@
 //! Checks whether the poses of a recording match its images.
 //!
-//! Poses in a wrong convention (inverted, other axes, other frames) train and score almost as well
+//! Poses in a wrong convention (inverted, or along other axes) train and score almost as well
 //! as right ones, and then mislead their users. The images are independent evidence: when a camera
 //! turns right, the image moves left. The check compares image motion ([`crate::image_motion`])
 //! with the motion of the poses, read in every common convention.
@@ -140,15 +140,15 @@ pub enum Verdict {
         /// The share explained with them.
         explained: f64,
     },
-    /// The poses belong to images some rows later, or earlier if negative.
+    /// The pose in row r belongs to the image in row r + `rows`.
     OtherRows {
         /// The number of rows.
         rows: i64,
         /// The share explained by the shifted poses.
         explained: f64,
     },
-    /// The poses do not explain the image motion in any convention, or turn while the images stand
-    /// still. They are of other frames, in another order, or of another recording.
+    /// The poses do not explain the image motion, or turn while the images stand still. They are of
+    /// other images, in another order, or of another recording.
     Unrelated {
         /// The share explained in the best convention.
         explained: f64,
@@ -417,7 +417,7 @@ fn best_shift(poses: &[Pose], read_as: Convention, observed: &[ObservedPair]) ->
         explained: 0.0,
     };
     for rows in -FURTHEST_SHIFT..=FURTHEST_SHIFT {
-        // An image's pose is `rows` rows before the image.
+        // The image in row r takes the pose in row r − rows.
         let shifted = |frame: FrameId| {
             let row = i64::from(frame.0) - rows;
             let is_there = (0..poses.len() as i64).contains(&row);

@@ -29,7 +29,7 @@ pub struct RoomImages<'a> {
     pub size: &'a SizeOf<'a>,
     /// Decodes an image; `None` if it cannot be read.
     pub read: &'a dyn Fn(&str) -> Option<RgbImage>,
-    /// The room's poses as the recording states them, before `read_as` was applied; one per frame.
+    /// The room's poses in meters, before they are converted by `read_as`; one per frame.
     pub stated: &'a [Pose],
     /// The convention in which the stated poses are read.
     pub read_as: Convention,
@@ -138,7 +138,8 @@ pub fn check_room(room: &Room, images: Option<&RoomImages<'_>>) -> PoseReport {
 }
 
 impl PoseReport {
-    /// Whether the poses are certainly wrong: contradicted by the images, or by themselves.
+    /// Whether the poses must not be used as they are: the images contradict them, or they
+    /// themselves are implausible.
     pub fn is_wrong(&self) -> bool {
         self.warnings.iter().any(|warning| match warning {
             PoseWarning::Path(path) => matches!(
@@ -313,7 +314,7 @@ impl fmt::Display for PathWarning {
             ),
             Self::Identities { count, first } => write!(
                 f,
-                "{count} poses are exactly the identity (or it along other axes) after others that \
+                "{count} poses are exactly the identity (in some axis convention) after others that \
                  are not, first at frame {first}: recorders write it when tracking is lost; remove \
                  these frames"
             ),

@@ -28,7 +28,7 @@ pub struct ProbeProtocol {
     pub m1: Option<MutualKnn>,
     /// How M2 treats neighbours in time and repeated rows.
     pub m2: Option<DimensionProtocol>,
-    /// Strides of M3, one plan per stride. The splits of the plans are overridden.
+    /// Plans of M3, of which only the stride is used.
     pub m3: Vec<TrainingPlan>,
     /// Training plans of M4, one per stride. Their seeds and splits are overridden.
     pub m4: Vec<TrainingPlan>,

@@ -25,12 +25,12 @@ fn word<S: Serializer>(verdict: &Verdict, to: S) -> Result<S::Ok, S::Error> {
 
 impl Claim {
     /// A claim decided by one confidence interval per feature set; see [`Verdict::of_intervals`].
-    /// `found` says when it holds for a feature set.
-    pub fn over_feature_sets(claim: &'static str, found: &str, cases: &[Option<bool>]) -> Self {
+    /// `criterion` says when it holds for a feature set.
+    pub fn over_feature_sets(claim: &'static str, criterion: &str, cases: &[Option<bool>]) -> Self {
         Self {
             claim,
             verdict: Verdict::of_intervals(cases),
-            found: format!("{found}: {}", count_words(cases, "feature sets")),
+            found: format!("{criterion}: {}", count_words(cases, "feature sets")),
         }
     }
 }
@@ -62,8 +62,8 @@ impl Verdict {
         }
     }
 
-    /// As [`Verdict::of`], over the conclusive cases. `None` is an inconclusive case, in which no
-    /// method could have succeeded.
+    /// As [`Verdict::of`], over the conclusive cases. `None` is an inconclusive case, which is
+    /// ignored.
     pub fn of_telling(cases: &[Option<bool>]) -> Self {
         let telling: Vec<bool> = cases.iter().copied().flatten().collect();
         if telling.is_empty() && !cases.is_empty() {
@@ -72,8 +72,8 @@ impl Verdict {
         Self::of(&telling)
     }
 
-    /// The verdict over cases decided by confidence intervals. `None` is an interval that contains
-    /// the limit. A claim is confirmed or contradicted only if all intervals agree.
+    /// The verdict over cases decided by confidence intervals. `None` is undecided: its interval
+    /// contains the limit, or there are too few rooms. A claim is confirmed or contradicted only if all intervals agree.
     pub fn of_intervals(cases: &[Option<bool>]) -> Self {
         match Self::of_telling(cases) {
             Self::Confirmed | Self::Contradicted if cases.contains(&None) => Self::Mixed,

@@ -24,8 +24,9 @@ pub struct StrideRecord {
     r2_by_room_and_seed: Vec<Vec<f64>>,
     /// R² of the constant baseline (the mean training motion), by room.
     constant_r2_by_room: Vec<f64>,
-    /// R² in the last fold only (the paper's split), by room: mean over seeds, then the constant's.
+    /// R² in the last fold only (the paper's split), by room: mean over seeds.
     last_fifth_r2_by_room: Vec<f64>,
+    /// The same for the constant baseline.
     last_fifth_constant_r2_by_room: Vec<f64>,
 }
 

@@ -3,14 +3,16 @@
 //! [`calibrate`] runs three steps in this order; step 3 needs the result of step 2:
 //!
 //! 1. `error_covariance`: the second moment of motion errors, used by calibrated retrieval.
-//! 2. `model`: the error model of a tracker: frame-to-frame noise of latents, errors of motions
-//!    and of poses estimated from matches, and the distances of frames of other rooms.
-//! 3. `map_pose_factor`: the covariance inflation of corrected map poses, chosen by replaying the
-//!    rooms through a tracker with the error model of step 2.
+//! 2. `model`: the error model of a tracker: frame-to-frame noise of latents; errors of motions;
+//!    errors of poses estimated from the most similar map frames; and how far frames of one room are
+//!    from the map of another.
+//! 3. `map_pose_factor`: one factor for the covariances of the poses that a tracker reports on a
+//!    map, chosen by replaying the rooms through a tracker with the error model of step 2.
 //!
-//! Errors are heavy-tailed and differ between rooms. The covariances of the error model are
-//! therefore Student's t fits. Each is then scaled so that its 68 % and 95 % ellipsoids contain
-//! nearly 68 % and 95 % of the errors. The covariance of step 1 is a plain second moment.
+//! Errors are heavy-tailed and differ between rooms. The covariances of motion and pose errors in
+//! the error model are therefore Student's t fits. Each is then scaled so that its 68 % and 95 %
+//! ellipsoids contain nearly 68 % and 95 % of the errors. The covariances of step 1 and of latents
+//! are plain second moments.
 
 mod anchors;
 mod embedded_room;

@@ -1,11 +1,14 @@
 //! Fits an adapter to one mapped room and localizes single views in that room.
 //!
+//! The mapped frames are the frames of the room that form its map; `seese3 fit` uses all frames.
+//!
 //! An adapter trained on other rooms estimates motions in a new room poorly. [`fit`] trains one on
-//! the mapped frames of the room itself. Near a mapped frame it is the best estimator; far from the
-//! map it can be worse than the pose of the nearest frame. The fit is therefore cross-validated:
-//! models trained without some of the mapped frames localize those frames. [`ReadingRules`] hold
-//! the result: for each range of distances from the map, an estimator, its gain and a covariance.
-//! A [`Localizer`] applies these rules.
+//! the mapped frames of the room itself. Near the map the fitted adapter is usually the best
+//! estimator; far from it, the pose of the nearest mapped frame can be better. The fit is therefore
+//! cross-validated: four more models, each trained without a part of the mapped frames, localize
+//! that part. [`ReadingRules`] hold the result for each range of distances from the map: an
+//! estimator and its gain (a factor from 0 to 1) for the translation, the same for the rotation, and
+//! a covariance. A [`Localizer`] applies these rules.
 //!
 //! Distances are between features, z-scored over the mapped frames, so that all estimators start
 //! from the same mapped frame.

@@ -1,9 +1,11 @@
 //! Route planning over a room's frames, from a view to a goal.
 //!
-//! - [`BelievedStart`] is the estimated start pose.
-//! - [`PoseGraph`] finds the shortest route in hops.
-//! - [`plan`] combines both and computes the probability of arrival when the route is driven open
-//!   loop. It returns no route if the start pose is too uncertain.
+//! - [`BelievedStart`] is the start pose: estimated from a view, recorded, or given.
+//! - [`PoseGraph`] finds the shortest route: the least sum of hop lengths, each hop of bounded
+//!   length.
+//! - [`plan`] combines both. It computes the probability that a camera that drives the route
+//!   without corrections arrives; only the error of the start pose counts. It returns no route if
+//!   that probability is too low.
 
 mod arrival;
 mod pose_graph;
@@ -21,8 +23,8 @@ use seese3_core::room::FrameId;
 
 /// Default minimum arrival probability of a planned route.
 ///
-/// Chosen on six calibration rooms from 0, 0.2, 0.3, 0.5 and 0.7: the smallest value for which no
-/// view of another room started a route.
+/// Chosen on six calibration rooms from 0, 0.2, 0.3, 0.5 and 0.7: the smallest value at which
+/// views of another room never got a route.
 pub const LEAST_ARRIVAL_PROBABILITY: f64 = 0.2;
 
 /// Result of planning.
@@ -38,7 +40,7 @@ pub enum Planned {
     },
     /// The start pose is unknown or too uncertain.
     StartUnknown(StartUnknown),
-    /// The start pose is known, but no route leads to the goal.
+    /// No route leads to the goal. The certainty of the start pose was not checked.
     NoRoute(NoRoute),
 }
 
@@ -47,7 +49,8 @@ pub enum Planned {
 pub enum StartUnknown {
     /// The view is out of distribution: it matches no place of the room.
     FarFromRoom {
-        /// Distance of the view divided by the room's limit, above 1.
+        /// Distance of the view from the room's map, divided by the largest accepted distance;
+        /// above 1.
         out_of_distribution: f64,
     },
     /// The start covariance is too large for this route and tolerance, for example because several

@@ -127,7 +127,8 @@ impl AuthLayer {
         let verb = match need {
             Some((_, Need::Nothing)) => return Ok(None),
             Some((_, Need::Verb(verb))) => Some(*verb),
-            // An unknown path: authenticated callers get "unimplemented", others "unauthenticated".
+            // A path without a row needs no verb; every service that is registered must have a row.
+            // On an unknown path, authenticated callers get "unimplemented", others "unauthenticated".
             None => None,
         };
 

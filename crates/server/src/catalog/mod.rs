@@ -2,9 +2,9 @@
 //!
 //! | file | what |
 //! | --- | --- |
-//! | `changes` | common steps of all changes: authorization, one at a time, reload of the store |
+//! | `changes` | common steps of all changes: one at a time, reload of the store, stored responses |
 //! | `recent` | stored responses to recent changes, for idempotent retries |
-//! | `room_upload` | uploads a room, frame by frame |
+//! | `room_upload` | uploads a room, in batches of frames |
 //! | `adapter_upload` | uploads an adapter |
 //! | `frames` | lists the frames of a room, for clients that plan or draw |
 //! | `refits` | fits an adapter to a room on the server |

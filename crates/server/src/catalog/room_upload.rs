@@ -1,4 +1,4 @@
-//! Room uploads, frame by frame.
+//! Room uploads, in batches of frames.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -80,7 +80,8 @@ struct Received {
 }
 
 impl Handlers {
-    /// Receives a room and publishes it.
+    /// Receives a room, checks it and, unless `validate_only`, publishes it or extends the stored
+    /// room.
     pub(super) async fn receive_room(
         &self,
         caller: Option<Arc<Principal>>,

@@ -46,7 +46,7 @@ pub struct ServedNavigator {
     pub trained_on: TrainedOn,
     /// Locates single views; only if the adapter was fitted to exactly these frames.
     pub reader: Option<Arc<RoomReader>>,
-    /// The reader of a preferred adapter, which gives the map's anchors.
+    /// The reader of the most preferred fitted adapter, from which the map takes its anchors.
     pub(super) tracking_reader: Option<Arc<RoomReader>>,
 }
 

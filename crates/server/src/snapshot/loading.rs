@@ -3,8 +3,10 @@
 //! - Unchanged parts are reused from the previous snapshot, so that a reload costs only what
 //!   changed.
 //! - A room or adapter that cannot be loaded is refused individually, and its previously served
-//!   revision remains in use. Without preloading, only a room's manifest is checked at this point.
-//! - A damaged revision is retried only on request; an unreadable one is retried at every reload.
+//!   revision remains in use. Without preloading, only the manifest of a room is checked at this
+//!   point, unless its previous revision is in memory.
+//! - A damaged revision is retried only when the operator asks for it (`Reload::requested`); an
+//!   unreadable one is retried at every reload.
 
 use std::collections::BTreeMap;
 use std::num::NonZero;

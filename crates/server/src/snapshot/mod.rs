@@ -147,7 +147,8 @@ impl Snapshot {
         room.is_some_and(|room| room.refusal().is_none())
     }
 
-    /// Whether both snapshots are equivalent: all their rooms, adapters and encoders are identical.
+    /// Whether both snapshots are equivalent: the same rooms, adapters, image encoders, default
+    /// adapters and refusals.
     pub fn is_like(&self, other: &Self) -> bool {
         fn same<T>(ours: &BTreeMap<String, Arc<T>>, theirs: &BTreeMap<String, Arc<T>>) -> bool {
             let is_same = |((name, ours), (other, theirs)): ((&String, &Arc<T>), _)| {
