@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, ArrayD};
 use safetensors::SafeTensors;
+use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
 use seese3_encoder::{
     Bounds, Encoder, Error, Filter, Layer, ModelTask, Preparation, Resize, Runtime, RuntimeKind,
@@ -75,6 +76,22 @@ fn tiny(file: &str, layers: Vec<Layer>, window: usize) -> ModelTask {
     }
 }
 
+/// A task of one layer of a tiny model of single images.
+fn tiny_layer(file: &str, name: &str, pooling: &str) -> ModelTask {
+    tiny(file, vec![layer(name, pooling)], 1)
+}
+
+/// Each image as a clip.
+fn alone(images: &[RgbImage]) -> Vec<Vec<&RgbImage>> {
+    images.iter().map(|image| vec![image]).collect()
+}
+
+#[track_caller]
+fn refused(model: Result<Encoder, Error>, word: &str) {
+    let message = model.map(|_| ()).unwrap_err().to_string();
+    assert!(message.contains(word), "{message}");
+}
+
 fn tiny_images() -> Vec<RgbImage> {
     let bytes = std::fs::read(golden().join("encoder/expected.safetensors")).unwrap();
     let file = SafeTensors::deserialize(&bytes).unwrap();
@@ -112,7 +129,7 @@ fn close(what: &str, found: &Array2<f32>, expected: &Array2<f64>, bound: f64) {
 fn layers_of_a_tiny_model_are_what_numpy_says() {
     let expected = Tensors::open(&golden().join("encoder/expected.safetensors"));
     let images = tiny_images();
-    let clips: Vec<Vec<&RgbImage>> = images.iter().map(|image| vec![image]).collect();
+    let clips = alone(&images);
     for runtime in runtimes() {
         let cases = [
             ("map", "mean", "map_mean"),
@@ -127,17 +144,11 @@ fn layers_of_a_tiny_model_are_what_numpy_says() {
         ];
 
         for (name, pooling, wanted) in cases {
-            let encoder =
-                Encoder::model(tiny("image.onnx", vec![layer(name, pooling)], 1), &runtime)
-                    .unwrap();
+            let task = tiny_layer("image.onnx", name, pooling);
+            let encoder = Encoder::model(task, &runtime).unwrap();
             let what = format!("{wanted} by {}", encoder.runtime());
-
-            close(
-                &what,
-                &encoder.encode(&clips).unwrap(),
-                &expected.rows(wanted),
-                1e-5,
-            );
+            let rows = encoder.encode(&clips).unwrap();
+            close(&what, &rows, &expected.rows(wanted), 1e-5);
         }
 
         let several = vec![
@@ -150,19 +161,16 @@ fn layers_of_a_tiny_model_are_what_numpy_says() {
         assert_eq!(encoder.dims(), [4, 16, 4]);
 
         let rows = encoder.encode(&clips).unwrap();
+        let middle = rows.slice_move(ndarray::s![.., 4..20]);
         close(
-            "the middle columns",
-            &rows.slice_move(ndarray::s![.., 4..20]),
+            "middle columns",
+            &middle,
             &expected.rows("map_grid2x2"),
             1e-5,
         );
 
-        let names: Vec<String> = encoder
-            .sources("m")
-            .into_iter()
-            .map(|source| source.name)
-            .collect();
-
+        let names = encoder.sources("m").into_iter().map(|source| source.name);
+        let names: Vec<String> = names.collect();
         assert_eq!(names, ["m-hidden-mean", "m-map-grid2x2", "m-vector"]);
     }
 }
@@ -192,19 +200,13 @@ fn clips_are_laid_out_as_their_model_wants_them() {
 
     for runtime in runtimes() {
         for file in ["clip_time_first.onnx", "clip_colour_first.onnx"] {
-            let encoder =
-                Encoder::model(tiny(file, vec![layer("colours", "mean")], 4), &runtime).unwrap();
-
-            close(
-                file,
-                &encoder.encode(&clips).unwrap(),
-                &expected.rows("clip_colours_mean"),
-                1e-5,
-            );
-
-            assert!(
-                Encoder::model(tiny(file, vec![layer("colours", "mean")], 3), &runtime).is_err()
-            );
+            let of_window = |window| {
+                let task = tiny(file, vec![layer("colours", "mean")], window);
+                Encoder::model(task, &runtime)
+            };
+            let rows = of_window(4).unwrap().encode(&clips).unwrap();
+            close(file, &rows, &expected.rows("clip_colours_mean"), 1e-5);
+            assert!(of_window(3).is_err());
         }
     }
 }
@@ -220,27 +222,52 @@ fn models_that_cannot_be_used_are_refused_by_name() {
     let broken = folder.path().join("broken.onnx");
     let whole = std::fs::read(golden().join("encoder/image.onnx")).unwrap();
     for runtime in runtimes() {
-        let refused = |task: ModelTask, word: &str| {
-            let message = Encoder::model(task, &runtime)
-                .map(|_| ())
-                .unwrap_err()
-                .to_string();
-
-            assert!(message.contains(word), "{message}");
+        let task = |name: &str, pooling: &str| tiny_layer("image.onnx", name, pooling);
+        let map = layer("map", "mean");
+        let with = |preparation| ModelTask {
+            preparation,
+            ..task("map", "mean")
         };
+        let nowhere = ModelTask {
+            file: "nowhere.onnx".into(),
+            ..task("map", "mean")
+        };
+        let wrong_size = with(Preparation {
+            resize: Resize::Whole {
+                width: 9,
+                height: 6,
+            },
+            ..centred()
+        });
+        let no_divisor = with(Preparation {
+            divisor: 0.0,
+            ..task("map", "mean").preparation
+        });
 
-        let task = |name: &str, pooling: &str| tiny("image.onnx", vec![layer(name, pooling)], 1);
-        refused(task("block9", "mean"), "map, tokens, vector");
-        refused(task("map", "cls"), "cannot be pooled");
-        refused(
-            task("classed", "grid2x2"),
-            "12 patches of the image and 1 before",
-        );
-        refused(task("classed", "mean"), "--prefix-tokens 1");
-        refused(
-            tiny("pairs.onnx", vec![layer("vector", "mean")], 1),
-            "exactly 2 images",
-        );
+        let two_maps = tiny("image.onnx", vec![map.clone(), map.clone()], 1);
+        let clips = tiny("image.onnx", vec![map], 4);
+        for (task, word) in [
+            (task("block9", "mean"), "map, tokens, vector"),
+            (task("map", "cls"), "cannot be pooled"),
+            (
+                task("classed", "grid2x2"),
+                "12 patches of the image and 1 before",
+            ),
+            (task("classed", "mean"), "--prefix-tokens 1"),
+            (
+                tiny_layer("pairs.onnx", "vector", "mean"),
+                "exactly 2 images",
+            ),
+            (task("tokens", "cls"), "--prefix-tokens 0"),
+            (two_maps, "twice"),
+            (tiny("image.onnx", Vec::new(), 1), "no layer"),
+            (clips, "single images"),
+            (nowhere, "nowhere.onnx"),
+            (wrong_size, "8x6"),
+            (no_divisor, "divisor"),
+        ] {
+            refused(Encoder::model(task, &runtime), word);
+        }
 
         // Whoever says that every token counts is believed.
         let stated = ModelTask {
@@ -248,61 +275,6 @@ fn models_that_cannot_be_used_are_refused_by_name() {
             ..task("classed", "mean")
         };
         assert!(Encoder::model(stated, &runtime).is_ok());
-
-        refused(task("tokens", "cls"), "--prefix-tokens 0");
-
-        refused(
-            tiny(
-                "image.onnx",
-                vec![layer("map", "mean"), layer("map", "mean")],
-                1,
-            ),
-            "twice",
-        );
-
-        refused(tiny("image.onnx", Vec::new(), 1), "no layer");
-
-        refused(
-            tiny("image.onnx", vec![layer("map", "mean")], 4),
-            "single images",
-        );
-
-        refused(
-            ModelTask {
-                file: "nowhere.onnx".into(),
-                ..task("map", "mean")
-            },
-            "nowhere.onnx",
-        );
-
-        let wrong_size = Preparation {
-            resize: Resize::Whole {
-                width: 9,
-                height: 6,
-            },
-            ..centred()
-        };
-
-        refused(
-            ModelTask {
-                preparation: wrong_size,
-                ..task("map", "mean")
-            },
-            "8x6",
-        );
-
-        let no_divisor = Preparation {
-            divisor: 0.0,
-            ..task("map", "mean").preparation
-        };
-
-        refused(
-            ModelTask {
-                preparation: no_divisor,
-                ..task("map", "mean")
-            },
-            "divisor",
-        );
 
         for cut in [0, 1, 10, whole.len() / 2, whole.len() - 1] {
             std::fs::write(&broken, &whole[..cut]).unwrap();
@@ -328,15 +300,13 @@ fn an_encoder_is_built_again_from_what_its_features_say() {
     let file = golden().join("encoder/image.onnx");
     let models = ["pixels".to_owned(), file.to_str().unwrap().to_owned()];
     for runtime in runtimes() {
-        let first = Encoder::model(
-            tiny("image.onnx", vec![layer("map", "grid2x2")], 1),
-            &runtime,
-        )
-        .unwrap();
+        let of_source = |source: &FeatureSource, models: &[String]| {
+            Encoder::of_source(source, models, &runtime).unwrap()
+        };
+        let task = tiny_layer("image.onnx", "map", "grid2x2");
+        let first = Encoder::model(task, &runtime).unwrap();
         let source = &first.sources("m")[0];
-        let again = Encoder::of_source(source, &models, &runtime)
-            .unwrap()
-            .unwrap();
+        let again = of_source(source, &models).unwrap();
 
         assert_eq!(&again.sources("m")[0], source);
 
@@ -345,31 +315,16 @@ fn an_encoder_is_built_again_from_what_its_features_say() {
             first.encode(&[vec![&images[0]]]).unwrap()
         );
 
-        let other = seese3_core::features::FeatureSource {
+        let other = FeatureSource {
             encoder: "image@0000".to_owned(),
             ..source.clone()
         };
-
-        assert!(
-            Encoder::of_source(&other, &models, &runtime)
-                .unwrap()
-                .is_none()
-        );
+        assert!(of_source(&other, &models).is_none());
 
         let pixels = &Encoder::pixels().sources("p")[0];
-        assert_eq!(
-            &Encoder::of_source(pixels, &models, &runtime)
-                .unwrap()
-                .unwrap()
-                .sources("p")[0],
-            pixels
-        );
-
-        assert!(
-            Encoder::of_source(pixels, &models[1..], &runtime)
-                .unwrap()
-                .is_none()
-        );
+        let again = of_source(pixels, &models).unwrap();
+        assert_eq!(&again.sources("p")[0], pixels);
+        assert!(of_source(pixels, &models[1..]).is_none());
     }
 
     for kind in [RuntimeKind::Tract, RuntimeKind::OnnxRuntime] {
@@ -379,7 +334,7 @@ fn an_encoder_is_built_again_from_what_its_features_say() {
             library: None,
         };
 
-        let task = tiny("image.onnx", vec![layer("map", "mean")], 1);
+        let task = tiny_layer("image.onnx", "map", "mean");
         match Encoder::model(task, &runtime) {
             Err(error @ Error::NotBuilt { .. }) => {
                 assert!(error.to_string().contains("--features full"))
@@ -403,22 +358,14 @@ fn an_encoder_is_built_again_from_what_its_features_say() {
 fn a_layer_that_does_not_count_images_is_refused() {
     for runtime in runtimes() {
         for name in ["turned", "scalar"] {
-            let refused =
-                Encoder::model(tiny("turned.onnx", vec![layer(name, "mean")], 1), &runtime);
-            let message = refused.map(|_| ()).unwrap_err().to_string();
-            assert!(message.contains(name), "{message}");
+            let turned = tiny_layer("turned.onnx", name, "mean");
+            refused(Encoder::model(turned, &runtime), name);
         }
 
-        let outside = Encoder::model(
-            tiny("outside.onnx", vec![layer("map", "mean")], 1),
-            &runtime,
-        );
-        let message = outside.map(|_| ()).unwrap_err().to_string();
-
-        assert!(
-            message.contains("outside.bin") && message.contains("beside the model"),
-            "{message}"
-        );
+        for word in ["outside.bin", "beside the model"] {
+            let outside = tiny_layer("outside.onnx", "map", "mean");
+            refused(Encoder::model(outside, &runtime), word);
+        }
     }
 }
 
@@ -432,14 +379,14 @@ fn a_layer_that_does_not_count_images_is_refused() {
 fn weights_may_lie_beside_the_model() {
     let expected = Tensors::open(&golden().join("encoder/expected.safetensors"));
     let images = tiny_images();
-    let clips: Vec<Vec<&RgbImage>> = images.iter().map(|image| vec![image]).collect();
+    let clips = alone(&images);
     let whole = golden().join("encoder");
 
     for runtime in runtimes() {
         // A declared output, and an inner value, which one runtime takes from a copy in memory.
         for (name, grid) in [("map", "map_grid2x2"), ("hidden", "hidden_mean")] {
             let pooling = if name == "map" { "grid2x2" } else { "mean" };
-            let task = tiny("beside.onnx", vec![layer(name, pooling)], 1);
+            let task = tiny_layer("beside.onnx", name, pooling);
             let encoder = Encoder::model(task, &runtime).unwrap();
             let rows = encoder.encode(&clips).unwrap();
             close(name, &rows, &expected.rows(grid), 1e-5);
@@ -452,7 +399,7 @@ fn weights_may_lie_beside_the_model() {
         let mut bytes = std::fs::read(whole.join("beside.bin")).unwrap();
         std::fs::write(&weights, &bytes).unwrap();
         let id = |file: &Path| {
-            let mut task = tiny("beside.onnx", vec![layer("map", "mean")], 1);
+            let mut task = tiny_layer("beside.onnx", "map", "mean");
             task.file = file.to_owned();
             Encoder::model(task, &runtime).map(|encoder| encoder.id().to_owned())
         };
@@ -506,6 +453,16 @@ struct RealModel {
     raw_bound: f64,
 }
 
+fn real_model(name: &str, preparation: &Preparation, layers: Vec<Layer>) -> ModelTask {
+    ModelTask {
+        file: shared().join(format!("models/{name}.onnx")),
+        preparation: preparation.clone(),
+        layers,
+        window: 1,
+        is_prefix_stated: true,
+    }
+}
+
 fn real_models() -> Vec<RealModel> {
     let names = |names: &[&str]| names.iter().map(|&name| name.to_owned()).collect();
     let dino = (1..=6)
@@ -549,24 +506,12 @@ fn real_models_give_pytorchs_features() {
     let folder = shared().join("models");
     for runtime in runtimes() {
         for model in real_models() {
-            let layers: Vec<Layer> = model
-                .layers
-                .iter()
-                .map(|name| layer(name, "mean"))
-                .collect();
-
-            let file = folder.join(format!("{}.onnx", model.name));
-            let task = ModelTask {
-                file,
-                preparation: model.preparation.clone(),
-                layers,
-                window: 1,
-                is_prefix_stated: true,
-            };
-
+            let layers = model.layers.iter().map(|name| layer(name, "mean"));
+            let layers = layers.collect();
+            let task = real_model(model.name, &model.preparation, layers);
             let encoder = Encoder::model(task, &runtime).unwrap();
             let images = stack(&folder.join("inputs").join(model.inputs));
-            let clips: Vec<Vec<&RgbImage>> = images.iter().map(|image| vec![image]).collect();
+            let clips = alone(&images);
             let rows = encoder.encode(&clips).unwrap();
 
             let mut from = 0;
@@ -611,32 +556,15 @@ fn real_models_give_pytorchs_maps() {
                     ref other => panic!("{other:?}"),
                 };
 
-                let file = folder.join(format!("{}.onnx", model.name));
-                let preparation = model.preparation.clone();
                 let layers = vec![layer(name, &pooling)];
-
-                let encoder = Encoder::model(
-                    ModelTask {
-                        file,
-                        preparation,
-                        layers,
-                        window: 1,
-                        is_prefix_stated: true,
-                    },
-                    &runtime,
-                )
-                .unwrap();
+                let task = real_model(model.name, &model.preparation, layers);
+                let encoder = Encoder::model(task, &runtime).unwrap();
 
                 let flat: Vec<f64> = expected.iter().map(|&x| f64::from(x)).collect();
                 let expected = Array2::from_shape_vec((3, flat.len() / 3), flat).unwrap();
                 let what = format!("{} {name} by {}", model.name, encoder.runtime());
-
-                close(
-                    &what,
-                    &encoder.encode(&clips).unwrap(),
-                    &expected,
-                    model.raw_bound,
-                );
+                let rows = encoder.encode(&clips).unwrap();
+                close(&what, &rows, &expected, model.raw_bound);
             }
         }
     }
@@ -649,8 +577,7 @@ fn real_models_give_pytorchs_maps() {
 #[test]
 #[ignore = "needs the folder of large inputs: SEESE3_SHARED or ../shared"]
 fn the_kitchens_photographs_give_its_features() {
-    let shared = shared();
-    let kitchen = shared.join("rooms/kitchen");
+    let kitchen = shared().join("rooms/kitchen");
 
     let frames: Vec<usize> = (0..1_000).step_by(40).collect();
     let agree = |encoder: &Encoder, file: &str, bound: f32| {
@@ -662,7 +589,7 @@ fn the_kitchens_photographs_give_its_features() {
             encoder.prepare(image).unwrap()
         };
         let images: Vec<RgbImage> = frames.iter().map(read).collect();
-        let clips: Vec<Vec<&RgbImage>> = images.iter().map(|image| vec![image]).collect();
+        let clips = alone(&images);
 
         for (row, &frame) in encoder.encode(&clips).unwrap().outer_iter().zip(&frames) {
             let expected = expected.row(frame);
@@ -680,39 +607,14 @@ fn the_kitchens_photographs_give_its_features() {
 
     for runtime in runtimes() {
         for (model, name, pooling, file, bound) in [
-            (
-                "effnetlite0",
-                "block14",
-                "mean",
-                "features_effnetlite0_block14_gap.npy",
-                0.025,
-            ),
-            (
-                "xfeat",
-                "block4",
-                "grid2x2",
-                "features_xfeat_block4_p2x2.npy",
-                0.01,
-            ),
-            (
-                "xfeat",
-                "block5",
-                "grid4x4",
-                "features_xfeat_block5_p4x4.npy",
-                0.01,
-            ),
+            ("effnetlite0", "block14", "mean", "block14_gap", 0.025),
+            ("xfeat", "block4", "grid2x2", "block4_p2x2", 0.01),
+            ("xfeat", "block5", "grid4x4", "block5_p4x4", 0.01),
         ] {
-            let preparation = recipe(model).unwrap().preparation.clone();
-            let file_name = shared.join(format!("models/{model}.onnx"));
-
-            let task = ModelTask {
-                file: file_name,
-                preparation,
-                layers: vec![layer(name, pooling)],
-                window: 1,
-                is_prefix_stated: true,
-            };
-            agree(&Encoder::model(task, &runtime).unwrap(), file, bound);
+            let preparation = &recipe(model).unwrap().preparation;
+            let task = real_model(model, preparation, vec![layer(name, pooling)]);
+            let encoder = Encoder::model(task, &runtime).unwrap();
+            agree(&encoder, &format!("features_{model}_{file}.npy"), bound);
         }
     }
 }
@@ -742,6 +644,12 @@ fn normalised_tensors_are_numpys() {
 
         assert!(worst <= 3e-7, "{}: {worst}", model.name);
     }
+}
+
+/// The largest difference of two images' bytes.
+fn worst_level<'a>(found: &[u8], expected: impl IntoIterator<Item = &'a u8>) -> u8 {
+    let pairs = found.iter().zip(expected);
+    pairs.map(|(a, b)| a.abs_diff(*b)).max().unwrap()
 }
 
 /// Oracle: Pillow's resize of the same decoded pixels. Both round to 8 bit after each pass, in
@@ -781,14 +689,7 @@ fn resized_images_are_pillows() {
             (expected.width, expected.height)
         );
 
-        let worst = found
-            .bytes
-            .iter()
-            .zip(&expected.bytes)
-            .map(|(a, b)| a.abs_diff(*b))
-            .max()
-            .unwrap();
-
+        let worst = worst_level(&found.bytes, &expected.bytes);
         assert!(worst <= bound, "{file} row {row}: {worst} levels");
     }
 }
@@ -804,14 +705,7 @@ fn decoded_photographs_are_pillows() {
     let found = read_image(&folder.join("inputs"), "frame-000000.color.jpg").unwrap();
     assert_eq!((found.width, found.height), (640, 480));
 
-    let worst = found
-        .bytes
-        .iter()
-        .zip(&expected)
-        .map(|(a, b)| a.abs_diff(*b))
-        .max()
-        .unwrap();
-
+    let worst = worst_level(&found.bytes, &expected);
     assert!(worst <= 5, "{worst} levels");
 }
 
