@@ -55,7 +55,7 @@ doc:
 # Licenses, sources and known vulnerabilities of dependencies, their number, those that nothing uses, the oldest Rust, typing
 # errors.
 hygiene:
-    cargo deny --all-features --hide-inclusion-graph check bans licenses sources
+    cargo deny --all-features check --hide-inclusion-graph bans licenses sources
     .ci/advisories
     .ci/crates
     .ci/msrv

@@ -176,7 +176,9 @@ fn what_a_bag_lacks_is_said() {
     );
     let problem = refused("bag.mcap", named(Some("/camera/raw"), None, Some("world")));
     assert!(
-        problem.contains("from 'world' to 'camera_optical'; it has base_link"),
+        problem.contains(
+            "connects 'world' and 'camera_optical'; the bag has transforms between base_link"
+        ),
         "{problem}"
     );
 
