@@ -235,25 +235,21 @@ impl Split {
 
         let tested = |frame| self.tests_frame(timeline, frame);
         let block = |frame: FrameId| frame.row() / BLOCK_FRAMES;
-        match self {
-            Self::Pairs => Some(if pair.source.0 % 5 == 2 {
+        if self == Self::Pairs {
+            return Some(if pair.source.0 % 5 == 2 {
                 Side::Test
             } else {
                 Side::Train
-            }),
-            _ => {
-                match (tested(pair.source), tested(pair.target)) {
-                    (false, false) => Some(Side::Train),
-                    // Training blocks lie between test blocks, so a test pair must stay within one
-                    // block.
-                    (true, true)
-                        if self != Self::Blocks || block(pair.source) == block(pair.target) =>
-                    {
-                        Some(Side::Test)
-                    }
-                    _ => None,
-                }
+            });
+        }
+
+        match (tested(pair.source), tested(pair.target)) {
+            (false, false) => Some(Side::Train),
+            // Training blocks lie between test blocks, so a test pair must stay within one block.
+            (true, true) if self != Self::Blocks || block(pair.source) == block(pair.target) => {
+                Some(Side::Test)
             }
+            _ => None,
         }
     }
 
