@@ -8,12 +8,14 @@
 //!   log(P₁⁻¹ P₂), v in meters, ω in radians, |ω| ≤ π.
 //! - v is the translation part of the logarithm, V(ω)⁻¹ t, not the translation t itself.
 
+mod camera;
 mod given_pose;
 mod pinhole;
 mod pose_error;
 mod rotation;
 mod se3;
 
+pub use camera::{CameraError, CameraIntrinsics, Distortion, PixelCamera as CameraInPixels};
 pub use given_pose::{
     GivenPoseError, MAX_ROTATION_DEVIATION, pose_from_matrix, pose_from_quaternion,
 };
