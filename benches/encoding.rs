@@ -61,7 +61,8 @@ fn encoder(shared: &Path, kind: RuntimeKind) -> Option<Encoder> {
         preparation: recipe.preparation.clone(),
         layers: vec![layer],
         window: 1,
-        is_prefix_stated: true,
+        keypoints: None,
+            is_prefix_stated: true,
     };
 
     Encoder::model(task, &runtime)

@@ -104,7 +104,7 @@ impl Encode {
 
         // Opening locks the journal, so that two processes cannot encode the same room into it at
         // once.
-        let (mut journal, before) = Journal::open(&path, &key, encoder.dims().iter().sum())?;
+        let (mut journal, before) = Journal::open(&path, &key)?;
         let begun = Instant::now();
 
         let encoded = self.encode(

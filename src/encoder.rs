@@ -9,7 +9,7 @@ use super::named::one_of;
 use super::output::say;
 use seese3_core::features::FeatureSource;
 use seese3_encoder::{
-    self, Encoder, EncoderRecipe, Filter, Layer, ModelTask, Pooling, Preparation, Preprocess,
+    self, Encoder, EncoderRecipe, Filter, KeypointOutputs, Layer, ModelTask, Pooling, Preparation, Preprocess,
     RECIPES, Resize, Runtime, RuntimeKind,
 };
 
@@ -60,7 +60,7 @@ pub struct EncoderOptions {
     #[arg(long, value_name = "FAMILY|FILE", value_parser = preprocessing, conflicts_with = "recipe")]
     preprocess: Option<Preprocessing>,
     /// Layers to keep, by output name, separated by commas; `all` keeps every output that the model
-    /// declares
+    /// declares, except those of keypoints
     #[arg(long, value_delimiter = ',', default_value = "all")]
     layers: Vec<String>,
     /// Pooling of a layer's output to one row: cls, mean, grid2x2, grid4x4 or any gridCOLUMNSxROWS;
@@ -164,8 +164,15 @@ impl EncoderOptions {
         let preparation = self.preparation(recipe, file)?;
 
         // `all` selects the outputs that the file declares, in the file's order.
+        let keypoints = recipe.and_then(|recipe| recipe.keypoints.clone());
+        let is_head = |name: &String| {
+            let heads = keypoints.as_ref().map(KeypointOutputs::names);
+            heads.is_some_and(|heads| heads.contains(&name))
+        };
         let names = if self.layers == ["all"] {
-            seese3_encoder::declared_outputs(file)?
+            let mut outputs = seese3_encoder::declared_outputs(file)?;
+            outputs.retain(|name| !is_head(name));
+            outputs
         } else {
             self.layers.clone()
         };
@@ -216,6 +223,7 @@ impl EncoderOptions {
                 preparation,
                 layers,
                 window,
+                keypoints,
                 is_prefix_stated: self.prefix_tokens.is_some() || recipe.is_some(),
             },
             runtime,

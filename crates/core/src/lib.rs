@@ -68,6 +68,7 @@
 //! | [`matrices`] | conversion between ndarray and nalgebra |
 //! | [`room`] | a recording: frames with poses, times and image names |
 //! | [`image`] | 8-bit RGB images |
+//! | [`keypoints`] | positions, scores and descriptors of the keypoints of an image |
 //! | [`features`] | one row of encoder output per frame, with its source |
 //! | [`index`] | nearest-neighbor search: exact scan, HNSW |
 //! | [`ridge`] | ridge regression in closed form |
@@ -88,6 +89,7 @@ pub mod geometry;
 pub mod matrices;
 pub mod room;
 pub mod image;
+pub mod keypoints;
 pub mod features;
 pub mod index;
 pub mod ridge;

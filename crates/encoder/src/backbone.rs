@@ -8,7 +8,7 @@ use ndarray::{ArrayD, Axis};
 
 use super::model_file::ModelFile;
 use super::runtime::{Runner, Runtime, RuntimeKind};
-use super::{Error, Layer, Preparation};
+use super::{Error, Preparation};
 
 /// What computes the outputs of layers from prepared images.
 pub(super) enum Backbone {
@@ -40,7 +40,7 @@ pub(super) type Opened = (Backbone, String, Option<(usize, usize)>);
 pub(super) fn open(
     file: &Path,
     preparation: &Preparation,
-    layers: &[Layer],
+    names: &[String],
     window: usize,
     runtime: &Runtime,
 ) -> Result<Opened, Error> {
@@ -52,7 +52,6 @@ pub(super) fn open(
         problem,
     };
 
-    let names: Vec<String> = layers.iter().map(|layer| layer.name.clone()).collect();
     if names.is_empty() {
         return Err(wrong("no layer was requested".into()));
     }
@@ -116,7 +115,7 @@ pub(super) fn open(
     }
 
     let id = model.id.clone();
-    let runner = runner(file, model, &names, &shape, runtime)?;
+    let runner = runner(file, model, names, &shape, runtime)?;
 
     Ok((
         Backbone::Model {

@@ -24,6 +24,7 @@
 mod builtin;
 mod decode;
 mod journal;
+mod keypoints;
 mod model_file;
 mod pooling;
 mod preparation;
@@ -41,7 +42,8 @@ mod backbone;
 
 pub use builtin::{BUILTIN_DIM, builtin_source, encode_builtin};
 pub use decode::{Bounds, decode, encode_png, image_size, read_image};
-pub use journal::{Journal, NumberedRows};
+pub use journal::{EncodedFrame, Journal, NumberedFrames};
+pub use keypoints::KeypointOutputs;
 pub use pooling::Pooling;
 pub use preparation::{Filter, Preparation, Resize, normalised};
 pub use preprocess::Preprocess;
@@ -56,9 +58,11 @@ use std::path::{Path, PathBuf};
 use ndarray::{Array2, ArrayD, Axis, IxDyn};
 
 use backbone::Backbone;
+use keypoints::KeypointMaps;
 use seese3_core::Cause;
 use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
+use seese3_core::keypoints::Keypoints;
 use seese3_core::room::is_plain_name;
 
 /// What can go wrong between an image file and a feature.
@@ -140,6 +144,8 @@ pub struct ModelTask {
     pub layers: Vec<Layer>,
     /// The number of images in a clip; 1 for a model of single images.
     pub window: usize,
+    /// The outputs from which keypoints are detected, for a model with keypoint heads.
+    pub keypoints: Option<KeypointOutputs>,
     /// Whether the number of prefix tokens was given explicitly. If not, a mean or grid that would
     /// include prefix tokens is an error.
     pub is_prefix_stated: bool,
@@ -158,6 +164,7 @@ pub struct Encoder {
     window: usize,
     /// The size (width, height) of prepared images, if the preparation or the model fixes it.
     size: Option<(usize, usize)>,
+    keypoints: Option<KeypointOutputs>,
 }
 
 impl Encoder {
@@ -177,6 +184,7 @@ impl Encoder {
             dims: vec![BUILTIN_DIM],
             window: 1,
             size: Some((64, 48)),
+            keypoints: None,
         }
     }
 
@@ -209,6 +217,7 @@ impl Encoder {
             dims: vec![3 * 16 * 12],
             window: 1,
             size: Some((320, 240)),
+            keypoints: None,
         }
     }
 
@@ -225,9 +234,24 @@ impl Encoder {
             preparation,
             layers,
             window,
+            keypoints,
             is_prefix_stated,
         } = task;
-        let (backbone, id, size) = backbone::open(&file, &preparation, &layers, window, runtime)?;
+
+        // Keypoint positions refer to the whole image.
+        if keypoints.is_some() && (preparation.crop.is_some() || window != 1) {
+            return Err(Error::Model {
+                file,
+                problem: "detects keypoints, so its images may not be cropped or in clips; leave out --crop \
+                          and --window"
+                    .into(),
+            });
+        }
+
+        let names = layers.iter().map(|layer| &layer.name);
+        let heads = keypoints.iter().flat_map(KeypointOutputs::names);
+        let names: Vec<String> = names.chain(heads).cloned().collect();
+        let (backbone, id, size) = backbone::open(&file, &preparation, &names, window, runtime)?;
 
         let mut encoder = Self {
             id,
@@ -237,6 +261,7 @@ impl Encoder {
             dims: Vec::new(),
             window,
             size,
+            keypoints,
         };
 
         // The trial run gives the rank and width of each output. If no size is fixed, it uses a
@@ -278,6 +303,12 @@ impl Encoder {
                 row.map_err(|error| problem(format!("layer '{}': {error}", layer.name).into()))?;
             encoder.dims.push(row.len());
         }
+
+        let detected = encoder.detect(&outputs, 0);
+        detected.map_err(|problem| Error::Model {
+            file,
+            problem: problem.into(),
+        })?;
 
         Ok(encoder)
     }
@@ -330,6 +361,7 @@ impl Encoder {
                 preparation,
                 layers: vec![layer],
                 window,
+                keypoints: None,
                 is_prefix_stated: true,
             };
 
@@ -372,6 +404,11 @@ impl Encoder {
         self.window
     }
 
+    /// Whether it detects keypoints.
+    pub fn detects_keypoints(&self) -> bool {
+        self.keypoints.is_some()
+    }
+
     /// The number of columns of each layer's feature.
     pub fn dims(&self) -> &[usize] {
         &self.dims
@@ -400,24 +437,75 @@ impl Encoder {
     /// the columns of all layers side by side.
     ///
     /// # Errors
-    /// [`Error::BadImage`] if images have different sizes or a size that the model does not take,
-    /// [`Error::Runtime`] if the network fails, [`Error::NotFinite`] if a feature is not finite.
+    /// As [`Encoder::encode_frames`].
     pub fn encode(&self, clips: &[Vec<&RgbImage>]) -> Result<Array2<f32>, Error> {
+        let frames = self.encode_frames(clips)?;
         let width = self.dims.iter().sum();
         let mut rows = Array2::zeros((clips.len(), width));
+        for (mut row, frame) in rows.outer_iter_mut().zip(&frames) {
+            row.assign(&ndarray::aview1(&frame.feature));
+        }
+
+        Ok(rows)
+    }
+
+    /// Features of prepared clips, and keypoints if the encoder detects them.
+    ///
+    /// # Errors
+    /// [`Error::BadImage`] if images have different sizes or a size that the model does not take,
+    /// [`Error::Runtime`] if the network fails, [`Error::NotFinite`] if a feature is not finite.
+    pub fn encode_frames(&self, clips: &[Vec<&RgbImage>]) -> Result<Vec<EncodedFrame>, Error> {
         if clips.is_empty() {
-            return Ok(rows);
+            return Ok(Vec::new());
         }
 
         // The built-in encoder computes whole rows, so that nothing is left to pool.
         if matches!(self.backbone, Backbone::Builtin) {
-            for (mut row, clip) in rows.outer_iter_mut().zip(clips) {
-                row.assign(&ndarray::aview1(&encode_builtin(clip[0])));
-            }
-            return Ok(rows);
+            let encoded = |clip: &Vec<&RgbImage>| EncodedFrame {
+                feature: encode_builtin(clip[0]),
+                keypoints: None,
+            };
+            return Ok(clips.iter().map(encoded).collect());
         }
 
         let outputs = self.outputs(clips)?;
+        let rows = self.pooled(clips, &outputs)?;
+
+        let mut frames = Vec::with_capacity(clips.len());
+        for (place, row) in rows.outer_iter().enumerate() {
+            let keypoints = self.detect(&outputs, place);
+            frames.push(EncodedFrame {
+                feature: row.to_vec(),
+                keypoints: keypoints.map_err(|problem| Error::Runtime {
+                    runtime: self.backbone.runtime(),
+                    problem: problem.into(),
+                })?,
+            });
+        }
+
+        Ok(frames)
+    }
+
+    /// Keypoints of the image at `place` of a batch, from the last three outputs; `None` if the
+    /// encoder detects none.
+    fn detect(&self, outputs: &[ArrayD<f32>], place: usize) -> Result<Option<Keypoints>, String> {
+        if self.keypoints.is_none() {
+            return Ok(None);
+        }
+
+        let map = |output: usize| outputs[self.layers.len() + output].index_axis(Axis(0), place);
+        let maps = KeypointMaps::new(map(0), map(1), map(2))?;
+        Ok(Some(maps.detect()))
+    }
+
+    /// Pooled outputs of all layers, shape (clips, sum of [`Encoder::dims`]).
+    fn pooled(
+        &self,
+        clips: &[Vec<&RgbImage>],
+        outputs: &[ArrayD<f32>],
+    ) -> Result<Array2<f32>, Error> {
+        let width = self.dims.iter().sum();
+        let mut rows = Array2::zeros((clips.len(), width));
         let runtime = self.backbone.runtime();
 
         let seen = pooling::InputSize {
@@ -428,7 +516,7 @@ impl Encoder {
 
         // Each layer fills its own columns of the row, which begin at `from`.
         let mut from = 0;
-        for ((layer, &dim), output) in self.layers.iter().zip(&self.dims).zip(&outputs) {
+        for ((layer, &dim), output) in self.layers.iter().zip(&self.dims).zip(outputs) {
             for (mut row, one) in rows.outer_iter_mut().zip(output.outer_iter()) {
                 let pooled = layer.pooling.pool(one, seen);
                 let pooled = pooled.map_err(|error| Error::Runtime {
@@ -526,12 +614,14 @@ impl Encoder {
         };
 
         // The first axis must be the clips, because one row per clip is read along it.
-        for (layer, output) in self.layers.iter().zip(&outputs) {
+        let names = self.layers.iter().map(|layer| &layer.name);
+        let heads = self.keypoints.iter().flat_map(KeypointOutputs::names);
+        for (name, output) in names.chain(heads).zip(&outputs) {
             if output.shape().first() != Some(&clips.len()) {
                 let problem = format!(
                     "layer '{}' gave an output of shape {:?} for a batch of {}: its first axis is not the batch; \
                      choose another layer, or transpose it in the export",
-                    layer.name,
+                    name,
                     output.shape(),
                     clips.len()
                 );

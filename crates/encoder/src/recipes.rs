@@ -6,7 +6,7 @@ use std::sync::LazyLock;
 use serde::Deserialize;
 
 use super::preparation::size;
-use super::{Error, Preparation};
+use super::{Error, KeypointOutputs, Preparation};
 
 /// Settings for a well-known encoder. The user provides the model.
 #[derive(Debug, Clone, Deserialize)]
@@ -31,6 +31,10 @@ pub struct EncoderRecipe {
     pub prefix_tokens: usize,
     /// The default pooling of a layer's output to one row; `--pool` overrides it.
     pub pooling: String,
+    /// The outputs from which keypoints are detected, for a model with keypoint heads. They are not
+    /// pooled to features.
+    #[serde(default)]
+    pub keypoints: Option<KeypointOutputs>,
     /// Its use in the paper.
     pub paper: String,
     /// Whether it was run in this project, and the sources of the recipe's numbers.

@@ -7,10 +7,11 @@ use std::collections::BTreeMap;
 use ndarray::Array2;
 use rayon::prelude::*;
 
-use super::journal::NumberedRows;
+use super::journal::{EncodedFrame, NumberedFrames};
 use super::{Encoder, Error, Journal};
 use seese3_core::cancel::Cancellation;
 use seese3_core::image::RgbImage;
+use seese3_core::keypoints::Keypoints;
 use seese3_core::room::{FrameId, Timeline};
 
 /// What to do with a frame whose image cannot be read.
@@ -42,6 +43,8 @@ pub struct Encoded {
     /// Features of the good frames, shape (good frames, sum of [`Encoder::dims`]), with the columns
     /// of all layers side by side.
     pub rows: Array2<f32>,
+    /// Keypoints of the good frames; empty if the encoder detects none.
+    pub keypoints: Vec<Keypoints>,
     /// For each row of features, the row of its frame in the room, ascending.
     pub good: Vec<usize>,
     /// The skipped frames, each with the reason.
@@ -50,12 +53,12 @@ pub struct Encoded {
     pub resumed: usize,
 }
 
-/// A journal, and the rows that were in it when it was opened.
+/// A journal, and the frames that were in it when it was opened.
 pub struct Kept<'a> {
-    /// New rows are appended to it batch by batch.
+    /// New frames are appended to it batch by batch.
     pub journal: &'a mut Journal,
-    /// The rows that [`Journal::open`] found in it.
-    pub before: NumberedRows,
+    /// The frames that [`Journal::open`] found in it.
+    pub before: NumberedFrames,
 }
 
 /// Encodes every frame, on the threads of the calling rayon pool. `done` is called with the number
@@ -78,17 +81,17 @@ pub fn encode_room(
         .map(|kept| std::mem::take(&mut kept.before))
         .unwrap_or_default();
 
-    // Rows are kept by frame number, so that those of the journal and the new ones end up in the
-    // order of the room.
-    let mut rows: BTreeMap<usize, Vec<f32>> = before
+    // Frames are kept by number, so that those of the journal and the new ones end up in the order
+    // of the room.
+    let mut frames: BTreeMap<usize, EncodedFrame> = before
         .into_iter()
         .filter(|(row, _)| *row < frame_count)
         .collect();
 
-    let resumed = rows.len();
+    let resumed = frames.len();
     done(resumed);
     let open: Vec<usize> = (0..frame_count)
-        .filter(|row| !rows.contains_key(row))
+        .filter(|row| !frames.contains_key(row))
         .collect();
     let mut chunks = open.chunks(task.batch.max(1));
 
@@ -110,34 +113,29 @@ pub fn encode_room(
         );
         let encoded = encoded?;
 
-        // These rows are written before an error of the next batch is returned, so that they are
-        // not computed a second time.
+        // These frames are written before an error of the next batch is returned, so that they are
+        // not encoded a second time.
         if let Some(kept) = &mut kept {
-            kept.journal.append(
-                clips
-                    .good
-                    .iter()
-                    .copied()
-                    .zip(encoded.outer_iter().map(row_of)),
-            )?;
+            kept.journal
+                .append(clips.good.iter().copied().zip(&encoded))?;
         }
 
-        rows.extend(
-            clips
-                .good
-                .iter()
-                .copied()
-                .zip(encoded.outer_iter().map(|row| row.to_vec())),
-        );
+        frames.extend(clips.good.iter().copied().zip(encoded));
 
         bad.extend(clips.bad);
-        done(rows.len() + bad.len());
+        done(frames.len() + bad.len());
         ready = prepared?;
     }
 
-    let good: Vec<usize> = rows.keys().copied().collect();
+    let good: Vec<usize> = frames.keys().copied().collect();
     let width = encoder.dims().iter().sum();
-    let numbers = rows.into_values().flatten().collect();
+    let mut numbers = Vec::with_capacity(good.len() * width);
+    let mut keypoints = Vec::new();
+    for frame in frames.into_values() {
+        numbers.extend(frame.feature);
+        keypoints.extend(frame.keypoints);
+    }
+
     let rows =
         Array2::from_shape_vec((good.len(), width), numbers).map_err(|error| Error::Runtime {
             runtime: encoder.runtime(),
@@ -146,15 +144,11 @@ pub fn encode_room(
 
     Ok(Encoded {
         rows,
+        keypoints,
         good,
         bad,
         resumed,
     })
-}
-
-/// The numbers of one row, which must be contiguous in memory.
-fn row_of(row: ndarray::ArrayView1<'_, f32>) -> &[f32] {
-    row.to_slice().unwrap_or_default()
 }
 
 /// The clips of one batch, with their prepared images.
@@ -167,13 +161,13 @@ struct Clips {
 }
 
 impl Clips {
-    fn encode(&self, encoder: &Encoder) -> Result<Array2<f32>, Error> {
+    fn encode(&self, encoder: &Encoder) -> Result<Vec<EncodedFrame>, Error> {
         let clips: Vec<Vec<&RgbImage>> = self
             .frames
             .iter()
             .map(|frames| frames.iter().map(|frame| &self.images[frame]).collect())
             .collect();
-        encoder.encode(&clips)
+        encoder.encode_frames(&clips)
     }
 }
 
@@ -306,7 +300,7 @@ mod tests {
         assert_eq!(clip(&timeline, 5, 5), [3, 4, 5, 5, 5]);
     }
 
-    fn kept(journal: &mut Journal, before: NumberedRows) -> Option<Kept<'_>> {
+    fn kept(journal: &mut Journal, before: NumberedFrames) -> Option<Kept<'_>> {
         Some(Kept { journal, before })
     }
 
@@ -338,7 +332,6 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("rows");
 
-        let width = encoder.dims()[0];
         let cancel = Cancellation::default();
         let asked = std::sync::Mutex::new(Vec::new());
 
@@ -359,7 +352,7 @@ mod tests {
             cancel: &cancel,
         };
 
-        let (mut journal, before) = Journal::open(&path, "k", width).unwrap();
+        let (mut journal, before) = Journal::open(&path, "k").unwrap();
         let first = encode_room(
             &task(&counting, OnBadImage::Skip),
             &encoder,
@@ -371,7 +364,7 @@ mod tests {
 
         drop(journal);
         asked.lock().unwrap().clear();
-        let (mut journal, before) = Journal::open(&path, "k", width).unwrap();
+        let (mut journal, before) = Journal::open(&path, "k").unwrap();
         let done = before.len();
 
         assert!(done >= 2, "something was journalled");
@@ -437,7 +430,7 @@ mod tests {
         let encoder = Encoder::builtin();
         let folder = tempfile::tempdir().unwrap();
         let (mut journal, before) =
-            Journal::open(&folder.path().join("rows"), "k", encoder.dims()[0]).unwrap();
+            Journal::open(&folder.path().join("rows"), "k").unwrap();
 
         let cancel = Cancellation::default();
         let task = Task {

@@ -37,6 +37,7 @@
 //!
 //! | module | purpose |
 //! | --- | --- |
+//! | [`matched_views`] | estimates a view's pose from keypoints matched with mapped keypoints |
 //! | [`tracking`] | tracks a camera frame by frame, with covariances |
 //! | [`planning`] | plans a route from a view to a goal, over a room's frames |
 //! | [`calibration`] | measures an adapter's errors in rooms that it was not trained on |
@@ -46,6 +47,7 @@
 //! Conventions are those of [`seese3_core`]. This crate does not access files, the network, the
 //! clock or the environment. Random numbers come from explicit seeds.
 
+pub mod matched_views;
 pub mod tracking;
 pub mod two_view;
 pub mod calibration;

@@ -51,6 +51,7 @@ impl TwoViewReader {
                 },
             }],
             window: recipe.window,
+            keypoints: None,
             is_prefix_stated: true,
         };
 

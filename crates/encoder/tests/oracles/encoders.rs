@@ -72,6 +72,7 @@ fn tiny(file: &str, layers: Vec<Layer>, window: usize) -> ModelTask {
         preparation,
         layers,
         window,
+        keypoints: None,
         is_prefix_stated: false,
     }
 }
@@ -271,6 +272,7 @@ fn models_that_cannot_be_used_are_refused_by_name() {
 
         // Whoever says that every token counts is believed.
         let stated = ModelTask {
+            keypoints: None,
             is_prefix_stated: true,
             ..task("classed", "mean")
         };
@@ -459,6 +461,7 @@ fn real_model(name: &str, preparation: &Preparation, layers: Vec<Layer>) -> Mode
         preparation: preparation.clone(),
         layers,
         window: 1,
+        keypoints: None,
         is_prefix_stated: true,
     }
 }

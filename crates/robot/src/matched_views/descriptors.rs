@@ -1,0 +1,156 @@
+//! Compressed descriptors of keypoints, and their matches.
+
+use nalgebra::DMatrix;
+use ndarray::{Array1, Array2, ArrayView2, Axis};
+
+use seese3_core::keypoints::Keypoints;
+
+/// Number of components of a compressed descriptor; one byte each.
+pub const COMPRESSED: usize = 32;
+
+/// Factor between a compressed descriptor of unit length and its 8-bit numbers.
+const SCALE: f32 = 200.0;
+/// Number of descriptors from which the principal components are computed.
+const SAMPLE: usize = 20_000;
+
+/// Mean and principal axes of the descriptors of a map. Compression subtracts the mean, projects
+/// onto the axes and scales to unit length.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DescriptorBasis {
+    /// Shape (d).
+    mean: Array1<f32>,
+    /// Shape (d, [`COMPRESSED`]), orthonormal columns.
+    axes: Array2<f32>,
+}
+
+impl DescriptorBasis {
+    /// Principal components of the descriptors of all frames; `None` without any descriptor.
+    pub fn of<'a>(frames: impl Iterator<Item = &'a Keypoints> + Clone) -> Option<Self> {
+        let count: usize = frames.clone().map(Keypoints::len).sum();
+        let width = frames
+            .clone()
+            .map(Keypoints::descriptor_width)
+            .max()
+            .filter(|&width| width > 0)?;
+
+        // Evenly spaced descriptors are enough for the components.
+        let every = count.div_ceil(SAMPLE).max(1);
+        let sample: Vec<f32> = frames
+            .flat_map(|frame| (0..frame.len()).map(move |place| frame.descriptor(place)))
+            .step_by(every)
+            .flat_map(|descriptor| descriptor.iter().map(|&value| f32::from(value)))
+            .collect();
+        let sample = Array2::from_shape_vec((sample.len() / width, width), sample).ok()?;
+
+        let mean = sample.mean_axis(Axis(0))?;
+        let centered = sample - &mean;
+        let moment = centered.t().dot(&centered);
+        let moment = DMatrix::from_fn(width, width, |row, column| f64::from(moment[(row, column)]));
+
+        let eigen = moment.symmetric_eigen();
+        let mut order: Vec<usize> = (0..width).collect();
+        order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
+        let axes = Array2::from_shape_fn((width, COMPRESSED), |(row, column)| {
+            let axis = order.get(column);
+            axis.map_or(0.0, |&axis| eigen.eigenvectors[(row, axis)] as f32)
+        });
+
+        Some(Self { mean, axes })
+    }
+
+    /// A basis from its numbers: `mean` of shape (d), `axes` of shape (d, [`COMPRESSED`]); `None`
+    /// for other shapes or numbers that are not finite.
+    pub fn from_parts(mean: Array1<f32>, axes: Array2<f32>) -> Option<Self> {
+        let is_finite = mean.iter().chain(&axes).all(|value| value.is_finite());
+        (axes.dim() == (mean.len(), COMPRESSED) && !mean.is_empty() && is_finite)
+            .then_some(Self { mean, axes })
+    }
+
+    /// Mean, shape (d).
+    pub fn mean(&self) -> &Array1<f32> {
+        &self.mean
+    }
+
+    /// Principal axes, shape (d, [`COMPRESSED`]).
+    pub fn axes(&self) -> &Array2<f32> {
+        &self.axes
+    }
+
+    /// Number of components of the descriptors before compression.
+    pub fn width(&self) -> usize {
+        self.mean.len()
+    }
+
+    /// Compressed descriptors, row by row, [`COMPRESSED`] bytes each.
+    pub fn compress(&self, keypoints: &Keypoints) -> Vec<i8> {
+        let mut full = Array2::zeros((keypoints.len(), self.width()));
+        for (place, mut row) in full.outer_iter_mut().enumerate() {
+            let numbers = keypoints.descriptor(place).iter();
+            for (to, &from) in row.iter_mut().zip(numbers) {
+                *to = f32::from(from);
+            }
+        }
+
+        let projected = (full - &self.mean).dot(&self.axes);
+        let mut compressed = Vec::with_capacity(projected.len());
+        for row in projected.outer_iter() {
+            let length = row.dot(&row).sqrt().max(1e-9);
+            compressed.extend(
+                row.iter()
+                    .map(|value| (value / length * SCALE).round().clamp(-127.0, 127.0) as i8),
+            );
+        }
+
+        compressed
+    }
+}
+
+/// Compressed descriptors as numbers, shape (n, [`COMPRESSED`]); cosines are their dot products.
+pub(super) fn unpacked(compressed: &[i8]) -> Array2<f32> {
+    let rows = compressed.len() / COMPRESSED;
+    Array2::from_shape_fn((rows, COMPRESSED), |(row, column)| {
+        f32::from(compressed[row * COMPRESSED + column]) / SCALE
+    })
+}
+
+/// Pairs (row of `a`, row of `b`) that are each other's most similar row and whose cosine is at
+/// least `min_cosine`.
+pub(super) fn mutual_matches(
+    a: ArrayView2<'_, f32>,
+    b: ArrayView2<'_, f32>,
+    min_cosine: f32,
+) -> Vec<(usize, usize)> {
+    let similarity = a.dot(&b.t());
+    let mut best_in_b = vec![(0, f32::NEG_INFINITY); a.nrows()];
+    let mut best_in_a = vec![(0, f32::NEG_INFINITY); b.nrows()];
+    for (row, similar) in similar_rows(&similarity) {
+        let best = &mut best_in_b[row];
+        for (column, &value) in similar.iter().enumerate() {
+            if value > best.1 {
+                *best = (column, value);
+            }
+            if value > best_in_a[column].1 {
+                best_in_a[column] = (row, value);
+            }
+        }
+    }
+
+    best_in_b
+        .iter()
+        .enumerate()
+        .filter(|&(row, &(column, cosine))| {
+            cosine >= min_cosine && best_in_a[column].0 == row
+        })
+        .map(|(row, &(column, _))| (row, column))
+        .collect()
+}
+
+/// The rows of a similarity matrix as slices, each with its number.
+fn similar_rows(similarity: &Array2<f32>) -> impl Iterator<Item = (usize, &[f32])> {
+    let width = similarity.ncols().max(1);
+    similarity
+        .as_slice()
+        .unwrap_or_default()
+        .chunks(width)
+        .enumerate()
+}

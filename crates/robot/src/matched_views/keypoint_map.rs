@@ -1,0 +1,274 @@
+//! The keypoints of a mapped room, with their inverse depths.
+
+use nalgebra::{Point3, Vector2, Vector3};
+
+use super::Error;
+use super::descriptors::{COMPRESSED, DescriptorBasis};
+use super::epipolar::EpipolarPairs;
+use super::parameters::MappingParameters;
+use super::triangulation::{PosedKeypoints, pixel_focal, triangulate};
+use seese3_core::geometry::{CameraIntrinsics, Pose};
+use seese3_core::keypoints::Keypoints;
+use seese3_core::statistics::quantile;
+
+/// The unit that mapping starts from, in median distances of the cameras from their mean.
+const FIRST_UNIT: f64 = 1.5;
+/// Rounds of triangulation that find the unit, and the number of frames of each.
+const UNIT_ROUNDS: usize = 3;
+const UNIT_FRAMES: usize = 15;
+/// Minimum number of triangulated keypoints from which a unit is computed.
+const MIN_UNIT_KEYPOINTS: usize = 20;
+
+/// Median epipolar error of a map in which too few frames overlap to measure it, pixels.
+const DEFAULT_EPIPOLAR_PX: f64 = 1.0;
+/// Range of the RANSAC threshold, pixels, and its ratio to the median epipolar error.
+const THRESHOLDS_PX: [f64; 2] = [2.0, 4.0];
+const THRESHOLD_RATIO: f64 = 3.0;
+
+/// Number of bytes of a stored keypoint: position, inverse depth, deviation, descriptor.
+pub const KEYPOINT_BYTES: usize = 4 + 4 + 2 + COMPRESSED;
+
+/// The triangulated keypoints of one mapped frame.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct MappedKeypoints {
+    /// Positions, fractions of the image's width and height from its top left corner.
+    pub points: Vec<Vector2<f32>>,
+    /// 1 / z in the camera frame, per meter.
+    pub inverse_depths: Vec<f32>,
+    /// Relative standard deviations of the inverse depths, at a deviation of 1 pixel.
+    pub deviations: Vec<f32>,
+    /// Compressed descriptors, [`COMPRESSED`] bytes each.
+    pub descriptors: Vec<i8>,
+}
+
+impl MappedKeypoints {
+    /// The number of keypoints.
+    pub fn len(&self) -> usize {
+        self.points.len()
+    }
+
+    /// Whether the frame has no triangulated keypoint.
+    pub fn is_empty(&self) -> bool {
+        self.points.is_empty()
+    }
+
+    /// Positions in the camera frame, meters.
+    pub(super) fn in_camera(&self, camera: &CameraIntrinsics) -> Vec<Vector3<f64>> {
+        self.points
+            .iter()
+            .zip(&self.inverse_depths)
+            .map(|(point, &inverse_depth)| {
+                let in_widths =
+                    Vector2::new(f64::from(point.x), f64::from(point.y) * camera.height());
+                camera.to_image_plane(in_widths).push(1.0) / f64::from(inverse_depth)
+            })
+            .collect()
+    }
+}
+
+/// The keypoints of a mapped room.
+#[derive(Debug, Clone)]
+pub struct KeypointMap {
+    /// The camera of all mapped frames.
+    pub camera: CameraIntrinsics,
+    /// Median depth of the keypoints, meters.
+    pub unit_m: f64,
+    /// Median distance of matched keypoints from their epipolar lines, pixels; measures the noise of
+    /// the map's poses and of its camera.
+    pub epipolar_px: f64,
+    /// Compression of the descriptors.
+    pub basis: DescriptorBasis,
+    /// Keypoints of each mapped frame, in the order of the frames.
+    pub frames: Vec<MappedKeypoints>,
+}
+
+impl KeypointMap {
+    /// Largest reprojection error of an inlier, pixels.
+    pub fn threshold_px(&self) -> f64 {
+        let [least, most] = THRESHOLDS_PX;
+        (THRESHOLD_RATIO * self.epipolar_px).clamp(least, most)
+    }
+}
+
+/// Triangulates the keypoints of a room's frames, frame by frame.
+pub struct Mapping<'a> {
+    frames: Vec<PosedKeypoints<'a>>,
+    camera: CameraIntrinsics,
+    basis: DescriptorBasis,
+    unit_m: f64,
+    epipolar_px: f64,
+    parameters: MappingParameters,
+}
+
+impl<'a> Mapping<'a> {
+    /// Prepares the mapping of frames with the given poses, `world_from_camera`, and keypoints.
+    ///
+    /// # Errors
+    /// [`Error::NoDescriptors`] if no frame has a keypoint.
+    ///
+    /// # Panics
+    /// If there are not as many poses as frames of keypoints.
+    pub fn new(
+        poses: &[Pose],
+        keypoints: &'a [Keypoints],
+        camera: CameraIntrinsics,
+        parameters: MappingParameters,
+    ) -> Result<Self, Error> {
+        assert_eq!(poses.len(), keypoints.len());
+        let basis = DescriptorBasis::of(keypoints.iter()).ok_or(Error::NoDescriptors)?;
+        let frames: Vec<PosedKeypoints<'_>> = poses
+            .iter()
+            .zip(keypoints)
+            .map(|(pose, keypoints)| {
+                PosedKeypoints::new(*pose, keypoints, &camera, parameters.candidates)
+            })
+            .collect();
+
+        let mut mapping = Self {
+            unit_m: first_unit(poses),
+            epipolar_px: DEFAULT_EPIPOLAR_PX,
+            frames,
+            camera,
+            basis,
+            parameters,
+        };
+        mapping.find_unit();
+        let pairs = EpipolarPairs::of(poses, keypoints, camera.height(), mapping.unit_m);
+        mapping.epipolar_px = pairs.median_px(&camera).unwrap_or(DEFAULT_EPIPOLAR_PX);
+        Ok(mapping)
+    }
+
+    /// Number of frames.
+    pub fn frame_count(&self) -> usize {
+        self.frames.len()
+    }
+
+    /// The keypoints of the frame in `row`.
+    pub fn map_frame(&self, row: usize) -> MappedKeypoints {
+        let frame = &self.frames[row];
+        let compressed = self.basis.compress(frame.keypoints);
+        let mut mapped = MappedKeypoints::default();
+        let triangulated = self.triangulated(row);
+        for point in triangulated.iter().take(self.parameters.max_keypoints) {
+            mapped.points.push(frame.keypoints.points()[point.place]);
+            mapped.inverse_depths.push(point.inverse_depth as f32);
+            mapped.deviations.push(point.deviation as f32);
+            mapped
+                .descriptors
+                .extend(&compressed[point.place * COMPRESSED..][..COMPRESSED]);
+        }
+
+        mapped
+    }
+
+    /// The map of all frames, in their order, as [`Self::map_frame`] computed them.
+    pub fn finish(self, frames: Vec<MappedKeypoints>) -> KeypointMap {
+        KeypointMap {
+            camera: self.camera,
+            unit_m: self.unit_m,
+            epipolar_px: self.epipolar_px,
+            basis: self.basis,
+            frames,
+        }
+    }
+
+    fn triangulated(&self, row: usize) -> Vec<super::triangulation::Triangulated> {
+        let neighbors: Vec<&PosedKeypoints<'_>> = self
+            .neighbors(row)
+            .into_iter()
+            .map(|row| &self.frames[row])
+            .collect();
+        triangulate(
+            &self.frames[row],
+            &neighbors,
+            pixel_focal(&self.camera),
+            self.unit_m,
+            &self.parameters,
+        )
+    }
+
+    /// Sets the unit to the median depth of the keypoints of some frames.
+    fn find_unit(&mut self) {
+        let every = (self.frames.len() / UNIT_FRAMES).max(1);
+        for _ in 0..UNIT_ROUNDS {
+            let rows = (0..self.frames.len()).step_by(every);
+            let depths: Vec<f64> = rows
+                .flat_map(|row| self.triangulated(row))
+                .map(|point| point.inverse_depth.recip())
+                .collect();
+            if depths.len() < MIN_UNIT_KEYPOINTS {
+                return;
+            }
+            if let Some(median) = quantile(&depths, 0.5) {
+                self.unit_m = median;
+            }
+        }
+    }
+
+    /// Frames near the one in `row` that see the same scene from another place, the best first.
+    fn neighbors(&self, row: usize) -> Vec<usize> {
+        let MappingParameters {
+            neighbors,
+            baseline_range: [least, most],
+            ideal_baseline,
+            max_angle_rad,
+            angle_scale_rad,
+            ..
+        } = self.parameters;
+        let pose = &self.frames[row].pose;
+        let distance = |a: &Pose, b: &Pose| {
+            (a.translation.vector - b.translation.vector).norm() / self.unit_m
+        };
+
+        let mut near: Vec<(f64, usize)> = self
+            .frames
+            .iter()
+            .enumerate()
+            .filter_map(|(other, frame)| {
+                let baseline = distance(&frame.pose, pose);
+                if baseline <= least || baseline >= most {
+                    return None;
+                }
+                let angle = angle_between_axes(&frame.pose, pose);
+                let score = (baseline / ideal_baseline).ln().abs() + angle / angle_scale_rad;
+                (angle < max_angle_rad).then_some((score, other))
+            })
+            .collect();
+        near.sort_by(|a, b| a.0.total_cmp(&b.0));
+
+        // Neighbors in one place would see every point from one direction.
+        let mut chosen: Vec<usize> = Vec::with_capacity(neighbors);
+        for (_, other) in near {
+            let apart = |&chosen: &usize| {
+                distance(&self.frames[chosen].pose, &self.frames[other].pose) > least
+            };
+            if chosen.iter().all(apart) {
+                chosen.push(other);
+            }
+            if chosen.len() == neighbors {
+                break;
+            }
+        }
+
+        chosen
+    }
+}
+
+/// Angle between the optical axes of two cameras, radians.
+pub(super) fn angle_between_axes(a: &Pose, b: &Pose) -> f64 {
+    (a.rotation * Vector3::z()).angle(&(b.rotation * Vector3::z()))
+}
+
+/// The unit from the spread of the cameras alone, meters.
+fn first_unit(poses: &[Pose]) -> f64 {
+    let mean = poses
+        .iter()
+        .fold(Vector3::zeros(), |sum, pose| sum + pose.translation.vector)
+        / poses.len().max(1) as f64;
+    let distances: Vec<f64> = poses
+        .iter()
+        .map(|pose| (pose * Point3::origin() - Point3::from(mean)).norm())
+        .collect();
+    let median = quantile(&distances, 0.5).unwrap_or(1.0);
+    if median > 0.0 { FIRST_UNIT * median } else { 1.0 }
+}

@@ -1,0 +1,182 @@
+//! Matches a view with mapped frames and estimates its pose.
+
+use std::collections::BTreeSet;
+
+use nalgebra::{Matrix6, Vector2};
+use ndarray::Array2;
+
+use super::absolute_pose::{Correspondence, Search, find_pose};
+use super::descriptors::{mutual_matches, unpacked};
+use super::keypoint_map::KeypointMap;
+use super::parameters::MatchingParameters;
+use super::triangulation::{pixel_focal, plane_points};
+use seese3_core::geometry::{CameraIntrinsics, Pose};
+use seese3_core::keypoints::Keypoints;
+
+/// Seed of RANSAC; equal views get equal answers.
+const SEED: u64 = 1;
+
+/// The keypoints of a view and its camera.
+#[derive(Debug, Clone, Copy)]
+pub struct ViewKeypoints<'a> {
+    /// Keypoints of the view.
+    pub keypoints: &'a Keypoints,
+    /// Its camera.
+    pub camera: &'a CameraIntrinsics,
+}
+
+/// Mapped frames that a view may resemble, the most promising first.
+#[derive(Debug, Clone, Copy)]
+pub struct PlaceCandidates<'a> {
+    /// Rows of the frames in the map.
+    pub frames: &'a [usize],
+}
+
+/// A view whose keypoints agree with the map under one pose.
+#[derive(Debug, Clone)]
+pub struct MatchedView {
+    /// `world_from_camera`.
+    pub pose: Pose,
+    /// Number of the view's keypoints that agree with the pose.
+    pub inliers: usize,
+    /// Number of the view's keypoints that were matched.
+    pub matched: usize,
+    /// The mapped frames with inliers, in the map's rows.
+    pub frames: Vec<usize>,
+    /// Information matrix (inverse covariance) of δ in true = pose · exp(δ), ordered (v, ω), if
+    /// the errors of all matches were independent.
+    pub information: Matrix6<f64>,
+    /// The inliers.
+    pub matches: Vec<InlierMatch>,
+}
+
+/// An inlier of a matched view.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct InlierMatch {
+    /// Place of the keypoint in the view.
+    pub keypoint: usize,
+    /// Row of the mapped frame.
+    pub frame: usize,
+    /// Place of the keypoint among those of the mapped frame.
+    pub mapped: usize,
+}
+
+impl KeypointMap {
+    /// Matches a view with candidate frames: first with a few, then with more if there are too few
+    /// inliers. `poses` are those of the map's frames, `world_from_camera`. `None` if no pose
+    /// agrees with the matches; the caller decides how many inliers it trusts.
+    pub fn match_view(
+        &self,
+        view: ViewKeypoints<'_>,
+        candidates: PlaceCandidates<'_>,
+        poses: &[Pose],
+        parameters: &MatchingParameters,
+    ) -> Option<MatchedView> {
+        let query = Query::new(self, view, parameters);
+        let first = parameters.first_frames.min(candidates.frames.len());
+        let found = query.matched(&candidates.frames[..first], poses, parameters);
+        let is_enough = |found: &MatchedView| found.inliers >= parameters.confident_inliers;
+        if found.as_ref().is_some_and(is_enough) || candidates.frames.len() == first {
+            return found;
+        }
+
+        let more = parameters.more_frames.min(candidates.frames.len());
+        let wider = query.matched(&candidates.frames[..more], poses, parameters);
+        let count = |found: &Option<MatchedView>| found.as_ref().map_or(0, |found| found.inliers);
+        if count(&wider) > count(&found) { wider } else { found }
+    }
+}
+
+/// A view, prepared for matching.
+struct Query<'a> {
+    map: &'a KeypointMap,
+    plane: Vec<Vector2<f64>>,
+    descriptors: Array2<f32>,
+}
+
+impl<'a> Query<'a> {
+    fn new(
+        map: &'a KeypointMap,
+        view: ViewKeypoints<'_>,
+        parameters: &MatchingParameters,
+    ) -> Self {
+        let plane = plane_points(view.keypoints, view.camera, parameters.candidates);
+        let mut compressed = map.basis.compress(view.keypoints);
+        compressed.truncate(plane.len() * super::COMPRESSED);
+        Self {
+            map,
+            plane,
+            descriptors: unpacked(&compressed),
+        }
+    }
+
+    fn matched(
+        &self,
+        frames: &[usize],
+        poses: &[Pose],
+        parameters: &MatchingParameters,
+    ) -> Option<MatchedView> {
+        let mut correspondences = Vec::new();
+        let mut mapped_places = Vec::new();
+        for &frame in frames {
+            let mapped = &self.map.frames[frame];
+            let pose = &poses[frame];
+            let in_camera = mapped.in_camera(&self.map.camera);
+            let pairs = mutual_matches(
+                self.descriptors.view(),
+                unpacked(&mapped.descriptors).view(),
+                parameters.min_cosine,
+            );
+
+            for (keypoint, place) in pairs {
+                let from_camera = pose.rotation * in_camera[place];
+                correspondences.push(Correspondence {
+                    keypoint,
+                    frame,
+                    plane: self.plane[keypoint],
+                    world: pose.translation.vector + from_camera,
+                    from_frame: from_camera,
+                    deviation: f64::from(mapped.deviations[place]),
+                });
+                mapped_places.push(place);
+            }
+        }
+
+        let search = Search {
+            focal_px: pixel_focal(&self.map.camera),
+            threshold_px: self.map.threshold_px(),
+            deviation_px: parameters.deviation_px,
+            noise: parameters.noise,
+            iterations: parameters.iterations,
+            miss_probability: parameters.miss_probability,
+            seed: SEED,
+        };
+        let found = find_pose(&correspondences, &search)?;
+
+        let inliers = || found.inliers.iter().map(|&place| &correspondences[place]);
+        let unique: BTreeSet<usize> = inliers().map(|match_| match_.keypoint).collect();
+        let frames: BTreeSet<usize> = inliers().map(|match_| match_.frame).collect();
+        let all: BTreeSet<usize> = correspondences
+            .iter()
+            .map(|match_| match_.keypoint)
+            .collect();
+        let matches = found
+            .inliers
+            .iter()
+            .map(|&place| InlierMatch {
+                keypoint: correspondences[place].keypoint,
+                frame: correspondences[place].frame,
+                mapped: mapped_places[place],
+            })
+            .collect();
+
+        Some(MatchedView {
+            pose: found.pose,
+            inliers: unique.len(),
+            matched: all.len(),
+            frames: frames.into_iter().collect(),
+            information: found.information,
+            matches,
+        })
+    }
+}

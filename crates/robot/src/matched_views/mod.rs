@@ -1,0 +1,41 @@
+//! Matched views: the pose of a view from keypoints matched with mapped keypoints of known depth.
+//!
+//! - Mapping triangulates the keypoints of each mapped frame from neighboring mapped frames, with
+//!   their known poses ([`Mapping`]).
+//! - A view is matched with a few retrieved frames. P3P in LO-RANSAC and a robust refinement give
+//!   its pose ([`KeypointMap::match_view`]). The number of unique inliers shows whether the view is
+//!   in the map.
+
+mod absolute_pose;
+mod descriptors;
+mod epipolar;
+mod keypoint_map;
+mod matching;
+mod p3p;
+mod parameters;
+mod triangulation;
+
+pub use epipolar::{CameraFit, EpipolarPairs};
+pub use absolute_pose::MapNoise;
+pub use descriptors::{COMPRESSED, DescriptorBasis};
+pub use keypoint_map::{KEYPOINT_BYTES, KeypointMap, MappedKeypoints, Mapping};
+pub use matching::{InlierMatch, MatchedView, PlaceCandidates, ViewKeypoints};
+pub use parameters::{MappingParameters, MatchingParameters, PIXEL_IMAGE_WIDTH};
+
+/// Why a keypoint map cannot be computed.
+#[derive(Debug, thiserror::Error, Clone, PartialEq)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
+pub enum Error {
+    #[error("no frame has a keypoint; check that the images are sharp and not blank")]
+    NoDescriptors,
+    #[error(
+        "only {matches} keypoints of nearby mapped frames match, too few to check the camera; map \
+         frames that overlap, 5 to 50 % of the depth apart"
+    )]
+    TooFewMatches { matches: usize },
+    #[error("the camera cannot be fitted to the matches of the map: {problem}")]
+    FitFailed {
+        #[source]
+        problem: seese3_core::geometry::CameraError,
+    },
+}

@@ -1,0 +1,99 @@
+//! Parameters of matched views. `seese3 evaluate localization` measures what they do.
+
+use super::absolute_pose::MapNoise;
+
+/// Width of the images in which pixels are counted: the input of XFeat.
+pub const PIXEL_IMAGE_WIDTH: f64 = 320.0;
+
+/// Parameters of mapping: the triangulation of a frame's keypoints from neighboring frames.
+///
+/// One *unit* is the median depth of a map's keypoints. Pixels are those of an image that is
+/// [`PIXEL_IMAGE_WIDTH`] pixels wide.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MappingParameters {
+    /// Maximum number of keypoints that are stored for a frame.
+    pub max_keypoints: usize,
+    /// Number of keypoints with the highest scores that are matched.
+    pub candidates: usize,
+    /// Maximum number of neighboring frames.
+    pub neighbors: usize,
+    /// Minimum and maximum distance to a neighboring frame, units.
+    pub baseline_range: [f64; 2],
+    /// Distance to a neighboring frame that is preferred, units.
+    pub ideal_baseline: f64,
+    /// Maximum angle between the optical axes of neighboring frames, radians.
+    pub max_angle_rad: f64,
+    /// Angle between optical axes that counts as much as a factor e in the baseline, radians.
+    pub angle_scale_rad: f64,
+    /// Maximum distance of a match from its epipolar line, pixels.
+    pub epipolar_gate_px: f64,
+    /// Minimum cosine of the descriptors of a match.
+    pub min_cosine: f32,
+    /// Maximum relative standard deviation of an inverse depth, at a deviation of 1 pixel.
+    pub max_deviation: f64,
+}
+
+impl Default for MappingParameters {
+    fn default() -> Self {
+        Self {
+            max_keypoints: 300,
+            candidates: 500,
+            neighbors: 5,
+            baseline_range: [0.03, 0.5],
+            ideal_baseline: 0.1,
+            max_angle_rad: 40_f64.to_radians(),
+            angle_scale_rad: 25_f64.to_radians(),
+            epipolar_gate_px: 3.0,
+            min_cosine: 0.7,
+            max_deviation: 0.2,
+        }
+    }
+}
+
+/// Parameters of the pose estimate of a view from its matches. Pixels are those of an image that is
+/// [`PIXEL_IMAGE_WIDTH`] pixels wide.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MatchingParameters {
+    /// Number of retrieved frames that are matched first.
+    pub first_frames: usize,
+    /// Number of retrieved frames that are matched if the first give fewer inliers than
+    /// `confident_inliers`.
+    pub more_frames: usize,
+    /// Number of keypoints of the view that are matched.
+    pub candidates: usize,
+    /// Minimum cosine of compressed descriptors.
+    pub min_cosine: f32,
+    /// Errors that the points of a mapped frame share.
+    pub noise: MapNoise,
+    /// Minimum and maximum number of RANSAC iterations.
+    pub iterations: [usize; 2],
+    /// Probability that RANSAC stops without an all-inlier sample.
+    pub miss_probability: f64,
+    /// Standard deviation of a keypoint's position, pixels.
+    pub deviation_px: f64,
+    /// Number of unique inliers from which no further frames are matched.
+    pub confident_inliers: usize,
+    /// Minimum number of unique inliers of an accepted pose.
+    pub min_inliers: usize,
+}
+
+impl Default for MatchingParameters {
+    fn default() -> Self {
+        Self {
+            first_frames: 3,
+            more_frames: 10,
+            candidates: 600,
+            min_cosine: 0.5,
+            iterations: [100, 2_000],
+            miss_probability: 1e-4,
+            deviation_px: 0.7,
+            noise: MapNoise {
+                translation_m: 0.005,
+                rotation_rad: 0.003,
+                log_depth: 0.03,
+            },
+            confident_inliers: 150,
+            min_inliers: 100,
+        }
+    }
+}
