@@ -8,15 +8,17 @@ use clap::Args;
 use serde_json::json;
 
 use super::encoder::{EncoderOptions, RuntimeOptions, feature_prefix, say_features};
+use super::keypoints::{check_aspect, map_keypoints, mapping_inputs, room_keypoints};
 use super::output::say;
 use super::progress::bar;
 use super::store_option::StoreAndJson;
 use seese3_core::cancel::Cancellation;
 use seese3_core::features::{FeatureSource, Features};
-use seese3_core::geometry::Pose;
+use seese3_core::geometry::{CameraIntrinsics, Pose};
 use seese3_core::room::{Room, is_plain_name};
 use seese3_encoder::{Encoded, Encoder, Journal, Kept, OnBadImage, Task, encode_room, read_image};
-use seese3_store::{Published, Store, StoredRoom};
+use seese3_robot::matched_views::{KeypointMap, MappedKeypoints};
+use seese3_store::{Published, RoomContents, RoomKeypoints, Store, StoredRoom};
 
 /// Maximum number of unreadable images that are listed one by one; further ones are only counted.
 const NAMED: usize = 20;
@@ -70,11 +72,14 @@ impl Encode {
         // end.
         let sources = encoder.sources(&feature_prefix(self.prefix.as_deref(), &self.model));
         check_names(&sources)?;
+        let camera = stored.room.provenance().camera;
+        let mapping = mapping_inputs(&encoder, camera, &self.room)?;
         let root = images_root(&stored.room, self.images.as_deref())?;
 
         // Features count as present only if encoder, layer and preprocessing match too. A set with
         // the same name and another source is replaced.
-        if !self.again && sources.iter().all(|source| has(&stored, source)) {
+        let has_keypoints = mapping.is_none() || has_keypoints(&stored, &sources[0]);
+        if !self.again && has_keypoints && sources.iter().all(|source| has(&stored, source)) {
             let names: Vec<&str> = sources.iter().map(|source| source.name.as_str()).collect();
             let room = &self.room;
             let revision = stored.revision;
@@ -138,12 +143,22 @@ impl Encode {
             );
         }
 
-        let published = publish(&store, newest, &sources, &encoded).await?;
+        let keypoints = match mapping {
+            Some((outputs, camera)) => {
+                let map = self.map(&newest.room, &encoded, camera)?;
+                Some(room_keypoints(map, sources[0].clone(), outputs, &self.model)?)
+            }
+            None => None,
+        };
+        let published = publish(&store, newest, &sources, &encoded, keypoints.as_ref()).await?;
 
         // The rows are safe in the store, so the journal is no longer needed.
         journal.finish()?;
 
         say_encoded(&encoded, &sources, seconds);
+        if let Some(keypoints) = &keypoints {
+            say_keypoints(&keypoints.map);
+        }
         let revision = published.revision;
         let location = store.location();
         say(format_args!(
@@ -181,6 +196,20 @@ impl Encode {
         }))
     }
 
+    /// Triangulates the keypoints of the encoded frames.
+    fn map(
+        &self,
+        room: &Room,
+        encoded: &Encoded,
+        camera: CameraIntrinsics,
+    ) -> anyhow::Result<KeypointMap> {
+        let poses = room.frames().select(&encoded.good).poses;
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(self.runtime.threads())
+            .build()?;
+        pool.install(|| map_keypoints(&poses, &encoded.keypoints, camera))
+    }
+
     fn journal_path(&self, key: &str) -> anyhow::Result<PathBuf> {
         let folder = match &self.journal {
             Some(folder) => folder.clone(),
@@ -207,7 +236,13 @@ impl Encode {
         kept: Kept<'_>,
     ) -> anyhow::Result<Encoded> {
         let images = room.images();
-        let image = |row: usize| read_image(root, &images[row]);
+        let keypoint_camera = encoder
+            .keypoint_outputs()
+            .and(room.provenance().camera.as_ref());
+        let image = |row: usize| {
+            let image = read_image(root, &images[row])?;
+            check_aspect(image, &images[row], keypoint_camera)
+        };
         let cancel = Cancellation::default();
 
         let on_bad = if self.skip_bad {
@@ -251,6 +286,26 @@ fn say_replaced(stored: &StoredRoom, sources: &[FeatureSource]) {
             source.name
         ));
     }
+}
+
+/// Whether the room has keypoints of the encoder pass that makes these features, mapped with the
+/// room's camera.
+fn has_keypoints(stored: &StoredRoom, feature: &FeatureSource) -> bool {
+    stored.keypoints.as_ref().is_some_and(|keypoints| {
+        keypoints.source.feature == *feature
+            && Some(keypoints.map.camera) == stored.room.provenance().camera
+    })
+}
+
+/// Prints how many keypoints were mapped.
+fn say_keypoints(map: &KeypointMap) {
+    let count: usize = map.frames.iter().map(MappedKeypoints::len).sum();
+    say(format_args!(
+        "mapped {:.0} keypoints a frame, median depth {:.2} m, epipolar error {:.2} pixels of an image 320 wide",
+        count as f64 / map.frames.len() as f64,
+        map.unit_m,
+        map.epipolar_px
+    ));
 }
 
 /// Prints how many frames were encoded, how fast, and into which features.
@@ -396,13 +451,20 @@ async fn publish(
     newest: StoredRoom,
     sources: &[FeatureSource],
     encoded: &Encoded,
+    keypoints: Option<&RoomKeypoints>,
 ) -> anyhow::Result<Published> {
     let is_whole = encoded.good.len() == newest.room.frame_count();
     let (room, features) = whole(newest, sources, encoded)?;
+    let contents = RoomContents {
+        room: &room,
+        features: &features,
+        keypoints,
+    };
 
-    Ok(match is_whole {
-        true => store.publish_same_frames(&room, &features).await?,
-        false => store.publish_room(&room, &features).await?,
+    Ok(if is_whole {
+        store.publish_contents_of_same_frames(contents).await?
+    } else {
+        store.publish_contents(contents).await?
     })
 }
 

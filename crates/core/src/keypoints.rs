@@ -3,6 +3,25 @@
 use nalgebra::Vector2;
 use ndarray::ArrayView2;
 
+use crate::features::FeatureSource;
+
+/// Source of the keypoints of a room: the encoder, its outputs, and the features of the same pass.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct KeypointSource {
+    /// Source of the features by which similar frames are retrieved; encoder and preprocessing are
+    /// those of the keypoints.
+    pub feature: FeatureSource,
+    /// The output with the probabilities of keypoints.
+    pub positions: String,
+    /// The output with the reliability of the descriptors.
+    pub reliability: String,
+    /// The output with the descriptors.
+    pub descriptors: String,
+    /// Path of the model's file when the room was encoded.
+    pub model_file: String,
+}
+
 /// Maximum number of keypoints of an image.
 pub const MAX_KEYPOINTS: usize = 600;
 

@@ -68,14 +68,15 @@
 //! | [`matrices`] | conversion between ndarray and nalgebra |
 //! | [`room`] | a recording: frames with poses, times and image names |
 //! | [`image`] | 8-bit RGB images |
-//! | [`keypoints`] | positions, scores and descriptors of the keypoints of an image |
 //! | [`features`] | one row of encoder output per frame, with its source |
+//! | [`keypoints`] | positions, scores and descriptors of the keypoints of an image |
 //! | [`index`] | nearest-neighbor search: exact scan, HNSW |
 //! | [`ridge`] | ridge regression in closed form |
 //! | [`splits`] | train/test splits of frame pairs; hold-outs of mapped frames |
 //! | [`statistics`] | means, quantiles, rates, the bootstrap over rooms, coverage of covariances |
 //! | [`motion_scores`] | R² of predicted motions |
 //! | [`trajectory`] | trajectory evaluation: association, alignment, APE, RPE |
+//! | [`epipolar`] | epipolar errors of matches under known poses; the camera fitted to them |
 //! | [`adapter`] | features to latents, latents to motions and back; networks and their training |
 //! | [`training`] | trains and scores an adapter on rooms |
 //! | [`navigation`] | retrieves the frames that a camera would see after a motion |
@@ -89,14 +90,15 @@ pub mod geometry;
 pub mod matrices;
 pub mod room;
 pub mod image;
-pub mod keypoints;
 pub mod features;
+pub mod keypoints;
 pub mod index;
 pub mod ridge;
 pub mod splits;
 pub mod statistics;
 pub mod motion_scores;
 pub mod trajectory;
+pub mod epipolar;
 pub mod adapter;
 pub mod training;
 pub mod navigation;

@@ -404,9 +404,9 @@ impl Encoder {
         self.window
     }
 
-    /// Whether it detects keypoints.
-    pub fn detects_keypoints(&self) -> bool {
-        self.keypoints.is_some()
+    /// The outputs from which it detects keypoints, if it does.
+    pub fn keypoint_outputs(&self) -> Option<&KeypointOutputs> {
+        self.keypoints.as_ref()
     }
 
     /// The number of columns of each layer's feature.

@@ -1,8 +1,11 @@
 //! Adds frames to a stored room, for instance a robot's own frames of unmapped places.
 
+use std::sync::Arc;
+
 use ndarray::{Axis, concatenate, s};
 
-use super::rooms::PublishPolicy;
+use super::room_keypoints::RoomKeypoints;
+use super::rooms::{PublishPolicy, RoomContents};
 use super::{
     ATTEMPTS, Error, Kind, Published, RoomSummary, Store, StoredRoom, check_features, revision_path,
 };
@@ -11,6 +14,7 @@ use seese3_core::Cause;
 use seese3_core::features::Features;
 use seese3_core::geometry::Pose;
 use seese3_core::room::{Frames, Provenance, Room};
+use seese3_robot::matched_views::MappedKeypoints;
 
 /// Handling of feature sets for which no rows are added.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,6 +30,7 @@ pub enum OtherFeatures {
 pub struct ExtendedRoom {
     room: Room,
     features: Vec<Features>,
+    keypoints: Option<RoomKeypoints>,
     /// The revision that was extended.
     base: u64,
     /// Whether the room already had the frames.
@@ -82,6 +87,7 @@ impl Store {
             let ExtendedRoom {
                 room,
                 features,
+                keypoints,
                 base,
                 is_there,
             } = self.extended_room(addition, features, others).await?;
@@ -96,8 +102,13 @@ impl Store {
             }
 
             // If another publisher was faster, retry: append the frames to its revision.
+            let contents = RoomContents {
+                room: &room,
+                features: &features,
+                keypoints: keypoints.as_ref(),
+            };
             match self
-                .publish_over(&room, &features, PublishPolicy::Revision(base))
+                .publish_over(contents, PublishPolicy::Revision(base))
                 .await
             {
                 Err(Error::OtherFrames { .. }) => {}
@@ -129,6 +140,7 @@ fn extended(
         return Ok(ExtendedRoom {
             room: base.room.clone(),
             features: base.features.clone(),
+            keypoints: base.keypoints.clone(),
             base: base.revision,
             is_there: true,
         });
@@ -158,11 +170,34 @@ fn extended(
 
     let room = Room::new(base.room.id().clone(), frames, provenance)
         .map_err(|error| refused(error.into()))?;
+    let keypoints = joined_keypoints(base, addition.frame_count(), &features);
     Ok(ExtendedRoom {
         room,
         features,
+        keypoints,
         base: base.revision,
         is_there: false,
+    })
+}
+
+/// The room's keypoints, with none for the added frames; `None` if the features of the same encoder
+/// pass are left behind.
+fn joined_keypoints(
+    base: &StoredRoom,
+    added: usize,
+    features: &[Features],
+) -> Option<RoomKeypoints> {
+    let RoomKeypoints { source, map } = base.keypoints.clone()?;
+    features
+        .iter()
+        .find(|set| set.source().name == source.feature.name)?;
+
+    let mut map = (*map).clone();
+    map.frames
+        .resize(map.frames.len() + added, MappedKeypoints::default());
+    Some(RoomKeypoints {
+        source,
+        map: Arc::new(map),
     })
 }
 

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::manifest::ObjectRef;
+use super::room_keypoints::KeypointsEntry;
 use super::stored_adapter::RoomFit;
 use seese3_core::adapter::{
     Adapter, Corrector, CorrectorKind, PairPlan, TrainConfig, TrainingRecord,
@@ -29,6 +30,9 @@ pub struct RoomBody {
     /// JSON list of image paths, one per frame, relative to the images root in `provenance`.
     pub images: Option<ObjectRef>,
     pub features: Vec<FeaturesEntry>,
+    /// Keypoints with inverse depths, of a room encoded by a model with keypoint heads.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub keypoints: Option<KeypointsEntry>,
     pub provenance: Provenance,
 }
 
@@ -37,7 +41,11 @@ impl RoomBody {
     pub fn objects(&self) -> impl Iterator<Item = &ObjectRef> {
         let names = self.frame_names.iter().chain(&self.images);
         let features = self.features.iter().map(|entry| &entry.object);
-        std::iter::once(&self.frames).chain(names).chain(features)
+        let keypoints = self.keypoints.iter().map(|entry| &entry.object);
+        std::iter::once(&self.frames)
+            .chain(names)
+            .chain(features)
+            .chain(keypoints)
     }
 }
 

@@ -40,6 +40,7 @@ mod manifest;
 mod resource;
 mod stored_adapter;
 mod tensors;
+mod room_keypoints;
 mod defaults;
 mod error_model;
 mod format;
@@ -61,8 +62,9 @@ pub use defaults::{Choice, Defaults, StandingDefaults};
 pub use extension::{ExtendedRoom, OtherFeatures};
 pub use garbage::{Garbage, GarbageFile};
 pub use removal::Removed;
+pub use room_keypoints::RoomKeypoints;
 pub use resource::{Kind, ResourceName, ResourceNameError};
-pub use rooms::{RoomSummary, StoredRoom, check_features};
+pub use rooms::{RoomContents, RoomSummary, StoredRoom, check_features};
 pub use stored_adapter::{BaseAdapter, RoomFit, StoredAdapter};
 pub use verification::Finding;
 
@@ -143,6 +145,12 @@ pub enum Error {
         name: String,
         rows: usize,
         room: String,
+        frame_count: usize,
+    },
+    #[error("the keypoints are of {frames} frames, room '{room}' has {frame_count}")]
+    KeypointFrames {
+        room: String,
+        frames: usize,
         frame_count: usize,
     },
     #[error("features '{name}' were given twice")]

@@ -5,6 +5,7 @@ use object_store::path::Path;
 
 use super::format::{FeaturesEntry, RoomBody};
 use super::manifest::{self, ObjectRef, SCHEMA};
+use super::room_keypoints::{KeypointsEntry, RoomKeypoints, keypoints_file, read_keypoints};
 use super::room_files::{
     features_file, frames_file, names_file, read_features, read_frames, read_names,
 };
@@ -14,6 +15,7 @@ use seese3_core::adapter::TrainingRecord;
 use seese3_core::eval::TrainedOn;
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::Pose;
+use seese3_core::keypoints::KeypointSource;
 use seese3_core::room::{Frames, Provenance, Room, RoomId, is_plain_name};
 
 /// A room loaded from the store, with its features.
@@ -27,6 +29,8 @@ pub struct StoredRoom {
     pub created: String,
     /// All feature sets of the room, or only the requested ones.
     pub features: Vec<Features>,
+    /// The keypoints of the room, if it has any.
+    pub keypoints: Option<RoomKeypoints>,
 }
 
 impl StoredRoom {
@@ -51,6 +55,8 @@ pub struct RoomSummary {
     pub frame_count: usize,
     /// The source of each feature set.
     pub features: Vec<FeatureSource>,
+    /// The source of the keypoints, if the room has any.
+    pub keypoints: Option<KeypointSource>,
     /// Origin of the recording.
     pub provenance: Provenance,
 }
@@ -61,6 +67,29 @@ struct RoomObjects {
     frame_names: Option<ObjectRef>,
     images: Option<ObjectRef>,
     features: Vec<FeaturesEntry>,
+    keypoints: Option<KeypointsEntry>,
+}
+
+/// What is published as one revision of a room.
+#[derive(Debug, Clone, Copy)]
+pub struct RoomContents<'a> {
+    /// The frames.
+    pub room: &'a Room,
+    /// Feature sets, one row per frame.
+    pub features: &'a [Features],
+    /// Keypoints of the frames.
+    pub keypoints: Option<&'a RoomKeypoints>,
+}
+
+impl<'a> RoomContents<'a> {
+    /// A room with features, without keypoints.
+    pub fn of(room: &'a Room, features: &'a [Features]) -> Self {
+        Self {
+            room,
+            features,
+            keypoints: None,
+        }
+    }
 }
 
 /// Condition on the newest revision for publishing the next one.
@@ -121,8 +150,17 @@ impl Store {
         room: &Room,
         features: &[Features],
     ) -> Result<Published, Error> {
-        self.publish_over(room, features, PublishPolicy::AnyFrames)
+        self.publish_over(RoomContents::of(room, features), PublishPolicy::AnyFrames)
             .await
+    }
+
+    /// Publishes a room with features and keypoints, like [`Store::publish_room`].
+    ///
+    /// # Errors
+    /// [`Error::KeypointFrames`] if the keypoints are not of as many frames as the room has,
+    /// otherwise as [`Store::publish_room`].
+    pub async fn publish_contents(&self, contents: RoomContents<'_>) -> Result<Published, Error> {
+        self.publish_over(contents, PublishPolicy::AnyFrames).await
     }
 
     /// Publishes a room like [`Store::publish_room`], but not over a newest revision with different
@@ -137,8 +175,19 @@ impl Store {
         room: &Room,
         features: &[Features],
     ) -> Result<Published, Error> {
-        self.publish_over(room, features, PublishPolicy::SameFrames)
-            .await
+        let contents = RoomContents::of(room, features);
+        self.publish_over(contents, PublishPolicy::SameFrames).await
+    }
+
+    /// Publishes a room with features and keypoints, like [`Store::publish_same_frames`].
+    ///
+    /// # Errors
+    /// As [`Store::publish_contents`] and [`Store::publish_same_frames`].
+    pub async fn publish_contents_of_same_frames(
+        &self,
+        contents: RoomContents<'_>,
+    ) -> Result<Published, Error> {
+        self.publish_over(contents, PublishPolicy::SameFrames).await
     }
 
     /// Publishes a room like [`Store::publish_room`], under the condition `over`.
@@ -148,21 +197,27 @@ impl Store {
     /// [`Store::publish_room`].
     pub(super) async fn publish_over(
         &self,
-        room: &Room,
-        features: &[Features],
+        contents: RoomContents<'_>,
         over: PublishPolicy,
     ) -> Result<Published, Error> {
+        let RoomContents {
+            room,
+            features,
+            keypoints,
+        } = contents;
         check_features(room, features)?;
+        check_keypoints(room, keypoints)?;
         let folder = folder_of(Kind::Room, room.id().as_str());
 
         // A repeated import, for instance without images, must not lose stored data: missing
         // columns are filled in from the newest revision.
         let (room, known) = &self.with_what_is_known(&folder, room).await?;
+        let contents = RoomContents { room, ..contents };
 
         // All objects are written before the manifest that references them. After an interruption
         // they are unreferenced.
         let objects = self
-            .write_objects(&folder, room, known.as_ref(), features)
+            .write_objects(&folder, contents, known.as_ref())
             .await?;
 
         // Optimistic concurrency: build the manifest on the newest revision and try to create the
@@ -184,6 +239,7 @@ impl Store {
                 frame_names: objects.frame_names.clone(),
                 images: objects.images.clone(),
                 features: objects.features.clone(),
+                keypoints: objects.keypoints.clone(),
                 provenance: room.provenance().clone(),
             };
 
@@ -201,6 +257,7 @@ impl Store {
                 if newest.frames == body.frames || self.has_poses(&folder, newest, room).await? {
                     let kept = features_to_keep(newest, &objects.features);
                     body.features.extend(kept);
+                    body.keypoints = body.keypoints.or(newest.keypoints.clone());
                 } else if over == PublishPolicy::SameFrames {
                     return Err(Error::OtherFrames {
                         room: room.id().to_string(),
@@ -223,7 +280,7 @@ impl Store {
                 .await?
             {
                 if !self
-                    .confirm(&folder, &body, room, known.as_ref(), features)
+                    .confirm(&folder, &body, contents, known.as_ref())
                     .await?
                 {
                     continue;
@@ -248,15 +305,13 @@ impl Store {
         &self,
         folder: &Path,
         body: &RoomBody,
-        room: &Room,
+        contents: RoomContents<'_>,
         known_frames: Option<&ObjectRef>,
-        features: &[Features],
     ) -> Result<bool, Error> {
         if !self.lacks(folder, body.objects()).await? {
             return Ok(true);
         }
-        self.write_objects(folder, room, known_frames, features)
-            .await?;
+        self.write_objects(folder, contents, known_frames).await?;
         if !self.lacks(folder, body.objects()).await? {
             return Ok(true);
         }
@@ -272,10 +327,14 @@ impl Store {
     async fn write_objects(
         &self,
         folder: &Path,
-        room: &Room,
+        contents: RoomContents<'_>,
         known_frames: Option<&ObjectRef>,
-        features: &[Features],
     ) -> Result<RoomObjects, Error> {
+        let RoomContents {
+            room,
+            features,
+            keypoints,
+        } = contents;
         let frames = match known_frames {
             Some(frames) => frames.clone(),
             None => {
@@ -302,11 +361,21 @@ impl Store {
             });
         }
 
+        let keypoints = match keypoints {
+            Some(keypoints) => {
+                let bytes = keypoints_file(&keypoints.map)?;
+                let object = self.write_object(folder, "keypoints", "safetensors", bytes);
+                Some(KeypointsEntry::new(keypoints, object.await?))
+            }
+            None => None,
+        };
+
         Ok(RoomObjects {
             frames,
             frame_names,
             images,
             features: entries,
+            keypoints,
         })
     }
 
@@ -475,6 +544,7 @@ impl Store {
             created: body.created,
             frame_count: body.frame_count,
             features: sources.collect(),
+            keypoints: body.keypoints.map(|entry| entry.source),
             provenance: body.provenance,
         })
     }
@@ -635,11 +705,20 @@ impl Store {
             features.push(set);
         }
 
+        let keypoints = match body.keypoints {
+            Some(entry) => {
+                let (file, bytes) = self.read_object(&folder, &entry.object).await?;
+                Some(read_keypoints(&file, &bytes, entry, room.frame_count())?)
+            }
+            None => None,
+        };
+
         Ok(StoredRoom {
             room,
             revision,
             created: body.created,
             features,
+            keypoints,
         })
     }
 
@@ -663,6 +742,19 @@ impl Store {
         manifest::check_place(&file, folder, (&body.room, body.revision), revision)?;
 
         Ok(body)
+    }
+}
+
+/// Checks that keypoints can be published with a room.
+fn check_keypoints(room: &Room, keypoints: Option<&RoomKeypoints>) -> Result<(), Error> {
+    let frame_count = room.frame_count();
+    match keypoints.map(|keypoints| keypoints.map.frames.len()) {
+        Some(frames) if frames != frame_count => Err(Error::KeypointFrames {
+            room: room.id().to_string(),
+            frames,
+            frame_count,
+        }),
+        _ => Ok(()),
     }
 }
 

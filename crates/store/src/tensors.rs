@@ -36,6 +36,33 @@ impl TensorWriter {
         );
     }
 
+    pub fn u16(&mut self, name: &str, shape: &[usize], values: impl Iterator<Item = u16>) {
+        self.0.insert(
+            name.to_owned(),
+            (
+                Dtype::U16,
+                shape.to_vec(),
+                values.flat_map(u16::to_le_bytes).collect(),
+            ),
+        );
+    }
+
+    pub fn u8(&mut self, name: &str, shape: &[usize], values: impl Iterator<Item = u8>) {
+        self.0
+            .insert(name.to_owned(), (Dtype::U8, shape.to_vec(), values.collect()));
+    }
+
+    pub fn i8(&mut self, name: &str, shape: &[usize], values: impl Iterator<Item = i8>) {
+        self.0.insert(
+            name.to_owned(),
+            (
+                Dtype::I8,
+                shape.to_vec(),
+                values.flat_map(i8::to_le_bytes).collect(),
+            ),
+        );
+    }
+
     pub fn i64(&mut self, name: &str, shape: &[usize], values: impl Iterator<Item = i64>) {
         self.0.insert(
             name.to_owned(),
@@ -86,6 +113,18 @@ impl<'a> TensorReader<'a> {
 
     pub fn f32(&self, name: &str) -> Result<Array2<f32>, Error> {
         self.rows(name, Dtype::F32, f32::from_le_bytes)
+    }
+
+    pub fn u16(&self, name: &str) -> Result<Array2<u16>, Error> {
+        self.rows(name, Dtype::U16, u16::from_le_bytes)
+    }
+
+    pub fn u8(&self, name: &str) -> Result<Array2<u8>, Error> {
+        self.rows(name, Dtype::U8, u8::from_le_bytes)
+    }
+
+    pub fn i8(&self, name: &str) -> Result<Array2<i8>, Error> {
+        self.rows(name, Dtype::I8, i8::from_le_bytes)
     }
 
     pub fn f64(&self, name: &str) -> Result<Array2<f64>, Error> {

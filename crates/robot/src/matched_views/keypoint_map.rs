@@ -1,12 +1,13 @@
 //! The keypoints of a mapped room, with their inverse depths.
 
 use nalgebra::{Point3, Vector2, Vector3};
+use ndarray::Array2;
 
 use super::Error;
-use super::descriptors::{COMPRESSED, DescriptorBasis};
-use super::epipolar::EpipolarPairs;
+use super::descriptors::{COMPRESSED, DescriptorBasis, mutual_matches};
 use super::parameters::MappingParameters;
 use super::triangulation::{PosedKeypoints, pixel_focal, triangulate};
+use seese3_core::epipolar::{EpipolarPairs, angle_between_axes};
 use seese3_core::geometry::{CameraIntrinsics, Pose};
 use seese3_core::keypoints::Keypoints;
 use seese3_core::statistics::quantile;
@@ -25,8 +26,10 @@ const DEFAULT_EPIPOLAR_PX: f64 = 1.0;
 const THRESHOLDS_PX: [f64; 2] = [2.0, 4.0];
 const THRESHOLD_RATIO: f64 = 3.0;
 
-/// Number of bytes of a stored keypoint: position, inverse depth, deviation, descriptor.
-pub const KEYPOINT_BYTES: usize = 4 + 4 + 2 + COMPRESSED;
+/// Minimum cosine of the descriptors of a match whose epipolar error is measured, and the number of
+/// keypoints of a frame that are matched.
+const EPIPOLAR_MIN_COSINE: f32 = 0.8;
+const EPIPOLAR_CANDIDATES: usize = 500;
 
 /// The triangulated keypoints of one mapped frame.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -133,7 +136,7 @@ impl<'a> Mapping<'a> {
             parameters,
         };
         mapping.find_unit();
-        let pairs = EpipolarPairs::of(poses, keypoints, camera.height(), mapping.unit_m);
+        let pairs = epipolar_pairs(poses, keypoints, camera.height(), mapping.unit_m);
         mapping.epipolar_px = pairs.median_px(&camera).unwrap_or(DEFAULT_EPIPOLAR_PX);
         Ok(mapping)
     }
@@ -254,11 +257,6 @@ impl<'a> Mapping<'a> {
     }
 }
 
-/// Angle between the optical axes of two cameras, radians.
-pub(super) fn angle_between_axes(a: &Pose, b: &Pose) -> f64 {
-    (a.rotation * Vector3::z()).angle(&(b.rotation * Vector3::z()))
-}
-
 /// The unit from the spread of the cameras alone, meters.
 fn first_unit(poses: &[Pose]) -> f64 {
     let mean = poses
@@ -272,3 +270,51 @@ fn first_unit(poses: &[Pose]) -> f64 {
     let median = quantile(&distances, 0.5).unwrap_or(1.0);
     if median > 0.0 { FIRST_UNIT * median } else { 1.0 }
 }
+
+/// Matched keypoints of nearby frames. `height` is that of the images, in image widths; `unit_m`
+/// about the median depth of the scene, meters.
+pub fn epipolar_pairs(
+    poses: &[Pose],
+    keypoints: &[Keypoints],
+    height: f64,
+    unit_m: f64,
+) -> EpipolarPairs {
+    EpipolarPairs::of(poses, unit_m, |first, second| {
+        matched_points(&keypoints[first], &keypoints[second], height)
+    })
+}
+
+/// Image points, image widths, of the mutual matches of two frames.
+fn matched_points(
+    first: &Keypoints,
+    second: &Keypoints,
+    height: f64,
+) -> Vec<[Vector2<f64>; 2]> {
+    let unit = |keypoints: &Keypoints| {
+        let count = keypoints.len().min(EPIPOLAR_CANDIDATES);
+        let width = keypoints.descriptor_width();
+        let mut rows = Array2::zeros((count, width));
+        for (place, mut row) in rows.outer_iter_mut().enumerate() {
+            for (to, &from) in row.iter_mut().zip(keypoints.descriptor(place)) {
+                *to = f32::from(from);
+            }
+            let length = row.dot(&row).sqrt().max(1e-9);
+            row /= length;
+        }
+        rows
+    };
+    let point = |keypoints: &Keypoints, place: usize| {
+        let point = keypoints.points()[place];
+        Vector2::new(f64::from(point.x), f64::from(point.y) * height)
+    };
+
+    let [a, b] = [unit(first), unit(second)];
+    if a.ncols() != b.ncols() {
+        return Vec::new();
+    }
+    mutual_matches(a.view(), b.view(), EPIPOLAR_MIN_COSINE)
+        .into_iter()
+        .map(|(i, j)| [point(first, i), point(second, j)])
+        .collect()
+}
+

@@ -8,19 +8,17 @@
 
 mod absolute_pose;
 mod descriptors;
-mod epipolar;
 mod keypoint_map;
 mod matching;
 mod p3p;
 mod parameters;
 mod triangulation;
 
-pub use epipolar::{CameraFit, EpipolarPairs};
 pub use absolute_pose::MapNoise;
 pub use descriptors::{COMPRESSED, DescriptorBasis};
-pub use keypoint_map::{KEYPOINT_BYTES, KeypointMap, MappedKeypoints, Mapping};
+pub use keypoint_map::{KeypointMap, MappedKeypoints, Mapping, epipolar_pairs};
 pub use matching::{InlierMatch, MatchedView, PlaceCandidates, ViewKeypoints};
-pub use parameters::{MappingParameters, MatchingParameters, PIXEL_IMAGE_WIDTH};
+pub use parameters::{MappingParameters, MatchingParameters};
 
 /// Why a keypoint map cannot be computed.
 #[derive(Debug, thiserror::Error, Clone, PartialEq)]
@@ -28,14 +26,4 @@ pub use parameters::{MappingParameters, MatchingParameters, PIXEL_IMAGE_WIDTH};
 pub enum Error {
     #[error("no frame has a keypoint; check that the images are sharp and not blank")]
     NoDescriptors,
-    #[error(
-        "only {matches} keypoints of nearby mapped frames match, too few to check the camera; map \
-         frames that overlap, 5 to 50 % of the depth apart"
-    )]
-    TooFewMatches { matches: usize },
-    #[error("the camera cannot be fitted to the matches of the map: {problem}")]
-    FitFailed {
-        #[source]
-        problem: seese3_core::geometry::CameraError,
-    },
 }

@@ -1,9 +1,8 @@
 //! Parameters of matched views. `seese3 evaluate localization` measures what they do.
 
 use super::absolute_pose::MapNoise;
-
-/// Width of the images in which pixels are counted: the input of XFeat.
-pub const PIXEL_IMAGE_WIDTH: f64 = 320.0;
+#[cfg(doc)]
+use seese3_core::epipolar::PIXEL_IMAGE_WIDTH;
 
 /// Parameters of mapping: the triangulation of a frame's keypoints from neighboring frames.
 ///
@@ -38,9 +37,9 @@ impl Default for MappingParameters {
         Self {
             max_keypoints: 300,
             candidates: 500,
-            neighbors: 5,
+            neighbors: 10,
             baseline_range: [0.03, 0.5],
-            ideal_baseline: 0.1,
+            ideal_baseline: 0.15,
             max_angle_rad: 40_f64.to_radians(),
             angle_scale_rad: 25_f64.to_radians(),
             epipolar_gate_px: 3.0,

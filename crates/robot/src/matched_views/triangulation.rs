@@ -2,7 +2,8 @@
 
 use nalgebra::{Matrix3, Vector2, Vector3};
 
-use super::parameters::{MappingParameters, PIXEL_IMAGE_WIDTH};
+use super::parameters::MappingParameters;
+use seese3_core::epipolar::PIXEL_IMAGE_WIDTH;
 use seese3_core::geometry::{CameraIntrinsics, Pose};
 use seese3_core::keypoints::Keypoints;
 

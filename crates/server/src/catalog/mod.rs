@@ -246,7 +246,8 @@ fn room(snapshot: &Snapshot, served: &ServedRoom) -> pb::Room {
         created,
         frame_count,
         features,
-        provenance,
+        keypoints: _,
+            provenance,
     } = &served.summary;
 
     pb::Room {

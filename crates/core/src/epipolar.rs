@@ -1,16 +1,29 @@
-//! Epipolar errors of matches between mapped frames with known poses: they measure the noise of
-//! poses and camera together, and the focal length and radial distortion can be fitted to them.
+//! Epipolar errors of matches between frames with known poses: they measure the noise of poses and
+//! camera together, and the focal length and radial distortion can be fitted to them.
 
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
-use ndarray::Array2;
 
-use super::Error;
-use super::descriptors::mutual_matches;
-use super::keypoint_map::angle_between_axes;
-use super::parameters::PIXEL_IMAGE_WIDTH;
-use seese3_core::geometry::{CameraError, CameraIntrinsics, Distortion, Pose};
-use seese3_core::keypoints::Keypoints;
-use seese3_core::statistics::quantile;
+use crate::geometry::{CameraError, CameraIntrinsics, Distortion, Pose};
+use crate::statistics::quantile;
+
+/// Why a camera cannot be fitted.
+#[derive(Debug, thiserror::Error, Clone, PartialEq)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
+pub enum Error {
+    #[error(
+        "only {matches} points of nearby frames match, too few to check the camera; map frames that \
+         overlap, 5 to 50 % of the depth apart"
+    )]
+    TooFewMatches { matches: usize },
+    #[error("the camera cannot be fitted to the matches: {problem}")]
+    OutOfRange {
+        #[source]
+        problem: CameraError,
+    },
+}
+
+/// Width of the images in which pixels are counted.
+pub const PIXEL_IMAGE_WIDTH: f64 = 320.0;
 
 /// Number of frames from which pairs begin.
 const FRAMES: usize = 100;
@@ -20,12 +33,8 @@ const PAIRS: usize = 4;
 const BASELINES: [f64; 2] = [0.06, 0.5];
 /// Maximum angle between the optical axes of a pair, degrees.
 const MAX_ANGLE_DEG: f64 = 40.0;
-/// Minimum cosine of the descriptors of a match.
-const MIN_COSINE: f32 = 0.8;
 /// Minimum number of matches of a pair.
 const MIN_MATCHES: usize = 30;
-/// Number of keypoints of a frame that are matched.
-const CANDIDATES: usize = 500;
 /// Maximum number of matches of a pair that are used.
 const MATCHES: usize = 60;
 /// Scale of the Cauchy loss, pixels.
@@ -41,7 +50,7 @@ const PRIOR: [f64; 2] = [0.2, 0.2];
 /// Minimum number of matches for a fit.
 const MIN_FIT_MATCHES: usize = 200;
 
-/// Matches between pairs of mapped frames.
+/// Matches between pairs of frames with known poses.
 #[derive(Debug, Clone)]
 pub struct EpipolarPairs {
     pairs: Vec<Pair>,
@@ -70,13 +79,16 @@ pub struct CameraFit {
 }
 
 impl EpipolarPairs {
-    /// Matches nearby frames. `unit_m` is about the median depth of the scene, meters; `height` the
-    /// height of the images in image widths.
+    /// Matches pairs of nearby frames that see the scene from different places.
     ///
-    /// # Panics
-    /// If there are not as many poses as frames of keypoints.
-    pub fn of(poses: &[Pose], keypoints: &[Keypoints], height: f64, unit_m: f64) -> Self {
-        assert_eq!(poses.len(), keypoints.len());
+    /// - `poses`: `world_from_camera`.
+    /// - `unit_m`: about the median depth of the scene, meters.
+    /// - `matched`: the matched image points, image widths, of two frames, by their rows.
+    pub fn of(
+        poses: &[Pose],
+        unit_m: f64,
+        mut matched: impl FnMut(usize, usize) -> Vec<[Vector2<f64>; 2]>,
+    ) -> Self {
         let every = (poses.len() / FRAMES).max(1);
         let rows: Vec<usize> = (0..poses.len()).step_by(every).collect();
         let [least, most] = BASELINES;
@@ -97,7 +109,7 @@ impl EpipolarPairs {
 
             let every = near.len().div_ceil(PAIRS).max(1);
             for &second in near.iter().step_by(every) {
-                let points = matched_points(&keypoints[first], &keypoints[second], height);
+                let points = matched(first, second);
                 if points.len() >= MIN_MATCHES {
                     pairs.push(Pair {
                         second_from_first: poses[second].inv_mul(&poses[first]),
@@ -130,7 +142,7 @@ impl EpipolarPairs {
     /// Fits the focal length and the first radial coefficient, starting from `stated`.
     ///
     /// # Errors
-    /// [`Error::TooFewMatches`] under 200 matches, [`Error::FitFailed`] if the fit leaves the range
+    /// [`Error::TooFewMatches`] under 200 matches, [`Error::OutOfRange`] if the fit leaves the range
     /// of cameras.
     pub fn fit(&self, stated: &CameraIntrinsics) -> Result<CameraFit, Error> {
         let matches = self.match_count();
@@ -138,7 +150,7 @@ impl EpipolarPairs {
             return Err(Error::TooFewMatches { matches });
         }
 
-        let failed = |problem: CameraError| Error::FitFailed { problem };
+        let failed = |problem: CameraError| Error::OutOfRange { problem };
         let mut at = Vector2::new(0.0, first_radial(stated.distortion()));
         let mut normal = Matrix2::identity();
         for _ in 0..STEPS {
@@ -279,42 +291,13 @@ fn first_radial(distortion: Distortion) -> f64 {
     distortion.coefficients().first().copied().unwrap_or(0.0)
 }
 
-/// Image points, image widths, of the mutual matches of two frames.
-fn matched_points(
-    first: &Keypoints,
-    second: &Keypoints,
-    height: f64,
-) -> Vec<[Vector2<f64>; 2]> {
-    let unit = |keypoints: &Keypoints| {
-        let count = keypoints.len().min(CANDIDATES);
-        let width = keypoints.descriptor_width();
-        let mut rows = Array2::zeros((count, width));
-        for (place, mut row) in rows.outer_iter_mut().enumerate() {
-            for (to, &from) in row.iter_mut().zip(keypoints.descriptor(place)) {
-                *to = f32::from(from);
-            }
-            let length = row.dot(&row).sqrt().max(1e-9);
-            row /= length;
-        }
-        rows
-    };
-    let point = |keypoints: &Keypoints, place: usize| {
-        let point = keypoints.points()[place];
-        Vector2::new(f64::from(point.x), f64::from(point.y) * height)
-    };
-
-    let [a, b] = [unit(first), unit(second)];
-    if a.ncols() != b.ncols() {
-        return Vec::new();
-    }
-    mutual_matches(a.view(), b.view(), MIN_COSINE)
-        .into_iter()
-        .map(|(i, j)| [point(first, i), point(second, j)])
-        .collect()
-}
-
 /// At most [`MATCHES`] of the points, evenly spaced.
 fn evenly(points: Vec<[Vector2<f64>; 2]>) -> Vec<[Vector2<f64>; 2]> {
     let every = points.len().div_ceil(MATCHES).max(1);
     points.into_iter().step_by(every).collect()
+}
+
+/// Angle between the optical axes of two cameras, radians.
+pub fn angle_between_axes(a: &Pose, b: &Pose) -> f64 {
+    (a.rotation * Vector3::z()).angle(&(b.rotation * Vector3::z()))
 }
