@@ -11,7 +11,7 @@ use super::store_option::StoreAndJson;
 use seese3_client::proto::v1 as pb;
 use seese3_core::features::Features;
 use seese3_core::geometry::Pose;
-use seese3_server::{pinhole_to_wire, source_to_wire};
+use seese3_server::{camera_to_wire, source_to_wire};
 use seese3_store::{Kind, ResourceName, StoredRoom};
 
 /// Target size of a message, bytes, well below the servers' limit. A message holds at least one
@@ -133,7 +133,7 @@ impl Push {
                 .collect(),
             format: own(&provenance.format),
             licence: own(&provenance.licence),
-            camera: provenance.camera.as_ref().map(pinhole_to_wire),
+            camera: provenance.camera.as_ref().map(camera_to_wire),
             validate_only: self.validate_only,
             extend: self.extend,
             drop_other_features: self.drop_other_features,

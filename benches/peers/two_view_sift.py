@@ -65,10 +65,12 @@ def main():
     root = pathlib.Path(bundle["images_root"])
     root = root if root.is_absolute() else given.folder / root
     sequences = bundle["sequences"] or [0] * len(poses)
-    focal, _, centre_x, centre_y = bundle.get("camera") or (None, None, 0.5, None)
-    focal = given.focal or focal
-    if focal is None:
+    stated = bundle.get("camera")
+    if stated is None and given.focal is None:
         raise SystemExit("the room states no camera: give --focal, fx in pixels over the image's width")
+    if stated and stated["distortion"]["model"] != "none":
+        raise SystemExit("the room's camera has a distorted lens, which this program does not undistort")
+    fx, fy = (given.focal, given.focal) if given.focal else stated["focal"]
 
     sift = cv2.SIFT_create(2000)
     found = {}
@@ -90,8 +92,9 @@ def main():
         truth = relative(poses[row], poses[row + given.stride])
         *first, (height, width) = features(row)
         *second, _ = features(row + given.stride)
-        y = centre_y * width if centre_y else height / 2
-        camera = np.array([[focal * width, 0, centre_x * width], [0, focal * width, y], [0, 0, 1.0]])
+        # OpenCV puts the center of the first pixel at (0, 0), the room at (0.5, 0.5).
+        x, y = np.multiply(stated["center"], width) - 0.5 if stated else ((width - 1) / 2, (height - 1) / 2)
+        camera = np.array([[fx * width, 0, x], [0, fy * width, y], [0, 0, 1.0]])
         motion = read(first, second, camera, width, np.linalg.norm(truth[:3, 3]))
         failed += motion is None
         off = relative(np.eye(4) if motion is None else motion, truth)

@@ -9,9 +9,10 @@ use super::{
     Server, diagonal, error_text, feature_view, frame_view, image_view, motion_text, revision,
     wire_json,
 };
-use crate::camera::CameraOption;
+use crate::camera::{CAMERA_FORM, CameraOption};
 use crate::output::{JsonOutput, say};
 use seese3_client::proto::v1 as pb;
+use seese3_server::camera_to_wire;
 
 #[derive(Debug, Args)]
 pub struct Motion {
@@ -40,9 +41,9 @@ pub struct Motion {
     /// Two JPEG or PNG files, A,B; the server must have been started with --encoder or --two-view
     #[arg(long, value_delimiter = ',', value_name = "A,B", conflicts_with_all = ["frames", "feature"])]
     images: Option<Vec<PathBuf>>,
-    /// Camera of --images, in pixels. With it, a server started with --two-view estimates the
-    /// motion by feature matching between the images, unless --adapter is given
-    #[arg(long, value_name = "WIDTHxHEIGHT,FOCAL[,CX,CY]", requires = "images")]
+    /// Camera of --images, as --camera of `seese3 import`. With it, a server started with --two-view
+    /// estimates the motion by feature matching between the images, unless --adapter is given
+    #[arg(long, value_name = CAMERA_FORM, requires = "images")]
     camera: Option<CameraOption>,
     /// A NumPy file of features, shape (n, d); --rows chooses two
     #[arg(long, value_name = "FILE", requires = "rows")]
@@ -81,13 +82,9 @@ impl Motion {
         self.json.begin()?;
 
         let (first, second) = self.views()?;
-        let camera = self.camera.map(|CameraOption(camera)| pb::Pinhole {
-            width: camera.width,
-            height: camera.height,
-            focal: camera.focal,
-            centre_x: camera.centre.map(|centre| centre.x),
-            centre_y: camera.centre.map(|centre| centre.y),
-        });
+        let camera = self
+            .camera
+            .map(|CameraOption(camera)| camera_to_wire(&camera));
 
         let request = pb::EstimateMotionRequest {
             adapter: self.adapter,

@@ -10,7 +10,7 @@ use seese3_core::splits::Split;
 use seese3_lab::experiments::motion::{Maps, evaluate};
 use seese3_lab::report::{MotionEvaluationJson, motion_table};
 
-use super::super::camera::CameraOption;
+use super::super::camera::{CAMERA_FORM, CameraOption};
 use super::super::output::{JsonOutput, say};
 use super::super::progress::bar;
 use seese3_encoder::{Pooling, Preparation};
@@ -31,8 +31,9 @@ pub struct Motion {
     /// at its full resolution, for example xfeat-fusion-grid40x30
     #[arg(long, value_name = "FEATURES")]
     two_view: Option<String>,
-    /// Camera of the images, in pixels, for --two-view; the room's own if omitted
-    #[arg(long, value_name = "WIDTHxHEIGHT,FOCAL[,CX,CY]", requires = "two_view")]
+    /// Camera of the images, as --camera of `seese3 import`, for --two-view; the room's own if
+    /// omitted
+    #[arg(long, value_name = CAMERA_FORM, requires = "two_view")]
     camera: Option<CameraOption>,
     /// Frames from the first view to the second
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
@@ -136,7 +137,7 @@ impl Motion {
         }
 
         let camera = match (self.camera, room.provenance().camera) {
-            (Some(camera), _) => camera.pinhole()?,
+            (Some(CameraOption(camera)), _) => camera,
             (None, Some(camera)) => camera,
             (None, None) => anyhow::bail!(
                 "room '{}' has no camera: give --camera, or import the room with --camera",

@@ -7,7 +7,7 @@ use clap::Args;
 use serde_json::json;
 
 use super::frame_summary::{say_dropped, say_frames};
-use crate::camera::CameraOption;
+use crate::camera::{CAMERA_FORM, CameraOption};
 use crate::encode::same_poses;
 use crate::encoder::say_features;
 use crate::output::{JsonOutput, say};
@@ -49,8 +49,10 @@ pub struct Destination {
     /// License of the recording, stored with the room
     #[arg(long, default_value = "")]
     licence: String,
-    /// Camera of the images, in pixels; needed for motion estimation between two images
-    #[arg(long, value_name = "WIDTHxHEIGHT,FOCAL[,CX,CY]")]
+    /// Camera of the images, in pixels; needed for motion estimation between two images. FOCAL may
+    /// be FX,FY if CX,CY follow. LENS is k1=N,k2=N,p1=N,p2=N,k3=N (Brown–Conrady; coefficients of 0
+    /// may be omitted) or fisheye=K1:K2:K3:K4 (Kannala–Brandt)
+    #[arg(long, value_name = CAMERA_FORM)]
     camera: Option<CameraOption>,
     #[command(flatten)]
     read_as: PoseOptions,
@@ -144,8 +146,7 @@ impl Destination {
             worst_rotation_deviation: recording.worst_rotation_deviation,
             camera: self
                 .camera
-                .map(CameraOption::pinhole)
-                .transpose()?
+                .map(|CameraOption(camera)| camera)
                 .or(stated.camera),
         };
 

@@ -279,7 +279,7 @@ class AsyncClient:
             adapter=adapter,
             first=wire_view(first),
             second=wire_view(second),
-            camera=requests.pinhole(camera),
+            camera=requests.wire_camera(camera),
             thresholds=thresholds,
         )
         return answers.Motion.of(await self._ask(self._odometry.EstimateMotion, request, deadline_s))
@@ -479,7 +479,7 @@ class AsyncClient:
             encode_for=f"adapters/{encode_for}" if encode_for else "",
             format=format,
             licence=licence,
-            camera=requests.pinhole(camera),
+            camera=requests.wire_camera(camera),
             request_id=request_id or requests.new_id(),
             validate_only=validate_only,
             extend=extend,

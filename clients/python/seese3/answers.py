@@ -112,28 +112,53 @@ class FeatureSource:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera, in pixels or in any other unit of length in the image. The middle is its centre by default."""
+    """A camera, in pixels or in any other unit of length in the image.
+
+    `fy` is `fx` by default, and the principal point the middle of the image. The upper left corner of the image is at
+    (0, 0): add 0.5 to the cx and cy of OpenCV and ROS. `distortion_model` is None, "brown_conrady" with at most 5
+    coefficients k1, k2, p1, p2, k3, or "kannala_brandt" with 4; they are those of OpenCV.
+    """
 
     width: float
     height: float
-    focal: float
-    centre_x: float | None = None
-    centre_y: float | None = None
+    fx: float
+    fy: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    distortion_model: str | None = None
+    distortion: Sequence[float] = ()
 
     def __post_init__(self) -> None:
         # Not a number is outside every range.
         if not (0 < self.width < float("inf") and 0.1 <= self.height / self.width <= 10):
             raise ValueError(f"camera: images of {self.width} x {self.height} are none of a camera")
-        if not 0.1 <= self.focal / self.width <= 10:
-            raise ValueError(f"camera: a focal length of {self.focal} is none for a width of {self.width}")
-        for name, value, size in (("x", self.centre_x, self.width), ("y", self.centre_y, self.height)):
+        for focal in (self.fx, self.fx if self.fy is None else self.fy):
+            if not 0.1 <= focal / self.width <= 10:
+                raise ValueError(f"camera: a focal length of {focal} is none for a width of {self.width}")
+        for name, value, size in (("cx", self.cx, self.width), ("cy", self.cy, self.height)):
             if value is not None and not 0 <= value <= size:
-                raise ValueError(f"camera: centre_{name} = {value} is outside of the image, 0 to {size}")
+                raise ValueError(f"camera: {name} = {value} is outside of the image, 0 to {size}")
+
+        model, count = self.distortion_model, len(self.distortion)
+        counts = {None: range(1), "brown_conrady": range(6), "kannala_brandt": range(4, 5)}
+        if model not in counts:
+            raise ValueError(f"camera: distortion_model {model!r} is none of {', '.join(map(repr, counts))}")
+        if count not in counts[model]:
+            raise ValueError(f"camera: distortion has {count} coefficients, which the model {model!r} does not take")
+        object.__setattr__(self, "distortion", tuple(map(float, self.distortion)))
 
     @classmethod
-    def of(cls, message: geometry_pb2.Pinhole) -> Camera:
+    def of(cls, message: geometry_pb2.CameraIntrinsics) -> Camera:
+        has_model = message.distortion_model != geometry_pb2.DISTORTION_MODEL_UNSPECIFIED
         return cls(
-            message.width, message.height, message.focal, _known(message, "centre_x"), _known(message, "centre_y")
+            message.width,
+            message.height,
+            message.fx,
+            message.fy or None,
+            _known(message, "cx"),
+            _known(message, "cy"),
+            _word(geometry_pb2.DistortionModel, message.distortion_model, "DISTORTION_MODEL_") if has_model else None,
+            message.distortion,
         )
 
 

@@ -56,15 +56,21 @@ def mode(word: str | None) -> Any:
     return enum_value(navigation_pb2.Mode, "MODE_", word, "mode")
 
 
-def pinhole(camera: Camera | None) -> geometry_pb2.Pinhole | None:
+def wire_camera(camera: Camera | None) -> geometry_pb2.CameraIntrinsics | None:
     if camera is None:
         return None
-    return geometry_pb2.Pinhole(
+    model: Any = enum_value(
+        geometry_pb2.DistortionModel, "DISTORTION_MODEL_", camera.distortion_model, "distortion_model"
+    )
+    return geometry_pb2.CameraIntrinsics(
         width=camera.width,
         height=camera.height,
-        focal=camera.focal,
-        centre_x=camera.centre_x,
-        centre_y=camera.centre_y,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        distortion_model=model,
+        distortion=camera.distortion,
     )
 
 
@@ -180,7 +186,7 @@ class TrackConfig:
                 displacement=self.keyframe_displacement, frames=self.keyframe_frames
             )
         others = [
-            odometry_pb2.RigCamera(name=other.name, pose=wire_pose(other.pose), camera=pinhole(other.camera))
+            odometry_pb2.RigCamera(name=other.name, pose=wire_pose(other.pose), camera=wire_camera(other.camera))
             for other in self.other_cameras
         ]
         pressure = odometry_pb2.BACK_PRESSURE_NEWEST if self.newest_only else odometry_pb2.BACK_PRESSURE_UNSPECIFIED
@@ -194,7 +200,7 @@ class TrackConfig:
             back_pressure=pressure,
             token_every=self.token_every,
             base_from_camera=None if self.base_from_camera is None else wire_pose(self.base_from_camera),
-            camera=pinhole(self.camera),
+            camera=wire_camera(self.camera),
             gravity_in_map=None if self.gravity_in_map is None else wire_vector(self.gravity_in_map),
             other_cameras=others,
         )

@@ -559,12 +559,18 @@ def _source(entry: dict[str, Any]) -> FeatureSource:
 
 def _stored_camera(camera: Camera) -> dict[str, Any]:
     """A camera as manifests state it: lengths in image widths."""
-    x = camera.width / 2 if camera.centre_x is None else camera.centre_x
-    y = camera.height / 2 if camera.centre_y is None else camera.centre_y
+    x = camera.width / 2 if camera.cx is None else camera.cx
+    y = camera.height / 2 if camera.cy is None else camera.cy
+    fy = camera.fx if camera.fy is None else camera.fy
+    distortion: dict[str, Any] = {"model": camera.distortion_model or "none"}
+    if camera.distortion_model is not None:
+        count = 5 if camera.distortion_model == "brown_conrady" else 4
+        distortion["coefficients"] = [*camera.distortion, *[0.0] * (count - len(camera.distortion))]
     return {
-        "focal": float(camera.focal / camera.width),
+        "focal": [float(camera.fx / camera.width), float(fy / camera.width)],
         "height": float(camera.height / camera.width),
-        "centre": [float(x / camera.width), float(y / camera.width)],
+        "center": [float(x / camera.width), float(y / camera.width)],
+        "distortion": distortion,
     }
 
 

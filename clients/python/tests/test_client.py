@@ -278,6 +278,8 @@ def test_arguments_that_are_none_are_refused_by_their_names(client: seese3.Clien
         (lambda: client.set_default(revision=3), "room and adapter"),
         (lambda: seese3.Prediction(1, 2), "exactly one"),
         (lambda: seese3.Camera(640, 480, float("inf")), "focal length"),
+        (lambda: seese3.Camera(640, 480, 525, distortion=[0.1]), "distortion has 1 coefficients"),
+        (lambda: seese3.Camera(640, 480, 525, distortion_model="fov"), "distortion_model 'fov'"),
         (lambda: seese3.Client("127.0.0.1:99999"), "no server address"),
         (lambda: seese3.Client("127.0.0.1:1", token="a\nb"), "token"),
     ):

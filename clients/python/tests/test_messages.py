@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+from seese3.answers import Camera
 from seese3.geometry import pose_matrix, wire_pose, wire_twist
+from seese3.requests import wire_camera
 from seese3.v1 import geometry_pb2 as pb
 from seese3.views import Feature, wire_view
 
@@ -53,3 +55,17 @@ def test_a_view_that_is_nothing_of_the_kind_is_refused() -> None:
     for rows in (np.zeros((2, 3)), np.arange(3)):
         with pytest.raises(ValueError, match="a feature is one row"):
             wire_view(rows)
+
+
+def test_a_camera_comes_back_from_the_wire() -> None:
+    for camera in (
+        Camera(640, 480, 525.0, 530.0, 330.0, 250.0),
+        Camera(640, 480, 525.0, distortion_model="brown_conrady", distortion=(0.1, -0.2, 0.001, -0.002, 0.03)),
+        Camera(640, 480, 525.0, distortion_model="kannala_brandt", distortion=(-0.03, 0.01, -0.002, 0.0005)),
+    ):
+        message = wire_camera(camera)
+        assert message is not None and Camera.of(message) == camera
+
+    # By hand: numbers that are left out are absent on the wire.
+    message = wire_camera(Camera(640, 480, 525.0))
+    assert message == pb.CameraIntrinsics(width=640, height=480, fx=525.0)

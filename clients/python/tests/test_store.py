@@ -35,7 +35,8 @@ def test_a_room_that_is_written_is_exported_by_the_program(tmp_path: Path) -> No
     store = seese3.Store(tmp_path / "store")
     rows = RANDOM.normal(size=(9, 5)).astype(np.float32)
     stated = poses(9)
-    camera = seese3.Camera(640, 480, 525.0)
+    lens = {"distortion_model": "brown_conrady", "distortion": (0.1, -0.2)}
+    camera = seese3.Camera(640, 480, 525.0, 530.0, cy=250.0, **lens)  # type: ignore[arg-type]
     times = np.arange(9) * 33_000_000
     assert store.write_room("hall", stated, {"mine": rows}, timestamps_ns=times, camera=camera).revision == 1
 
@@ -43,6 +44,12 @@ def test_a_room_that_is_written_is_exported_by_the_program(tmp_path: Path) -> No
     seese3.run("export", "numpy", "--store", store.folder, "--room", "hall", "--out", tmp_path / "out")
     np.testing.assert_allclose(np.load(tmp_path / "out/poses.npy"), stated, atol=1e-12)
     np.testing.assert_array_equal(np.load(tmp_path / "out/features_mine.npy"), rows)
+    assert json.loads((tmp_path / "out/bundle.json").read_text())["camera"] == {
+        "focal": [525 / 640, 530 / 640],
+        "height": 0.75,
+        "center": [0.5, 250 / 640],
+        "distortion": {"model": "brown_conrady", "coefficients": [0.1, -0.2, 0.0, 0.0, 0.0]},
+    }
 
     # The same again is no new revision; other features of the same poses are added to those that were there.
     assert store.write_room("hall", stated, {"mine": rows}, timestamps_ns=times, camera=camera).revision == 1

@@ -153,8 +153,13 @@ class Bridge(Node):
     def on_camera_info(self, info):
         if self.begins.is_set():
             return
-        if (camera := requests.pinhole(info)) is None:
-            self.get_logger().warning("camera_info is not calibrated: fields of view are not compared")
+        problem = "is not calibrated"
+        try:
+            camera = requests.camera(info)
+        except ValueError as error:
+            camera, problem = None, error
+        if camera is None:
+            self.get_logger().warning(f"camera_info: {problem}: fields of view are not compared")
         else:
             self.config.camera.CopyFrom(camera)
         self.begins.set()

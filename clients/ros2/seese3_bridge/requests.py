@@ -68,11 +68,32 @@ def direction(name, numbers):
     return geometry_pb2.Vector3(x=numbers[0], y=numbers[1], z=numbers[2])
 
 
-def pinhole(info):
-    """The camera of a sensor_msgs/CameraInfo, or None of one that is not calibrated."""
+def camera(info):
+    """The camera of a sensor_msgs/CameraInfo, or None of one that is not calibrated.
+
+    Raises ValueError for a distortion that the server does not know."""
     if info.width == 0 or info.height == 0 or info.k[0] <= 0:
         return None
-    return geometry_pb2.Pinhole(width=info.width, height=info.height, focal=info.k[0])
+
+    model, coefficients = distortion(info.distortion_model, list(info.d))
+    # ROS puts the center of the first pixel at (0, 0), the server at (0.5, 0.5).
+    return geometry_pb2.CameraIntrinsics(width=info.width, height=info.height, fx=info.k[0], fy=info.k[4],
+                                         cx=info.k[2] + 0.5, cy=info.k[5] + 0.5,
+                                         distortion_model=model, distortion=coefficients)
+
+
+def distortion(model, coefficients):
+    """The model and the coefficients on the wire of a CameraInfo's distortion_model and d."""
+    if model == "equidistant":
+        if len(coefficients) != 4:
+            raise ValueError(f"distortion_model equidistant has 4 coefficients, not {len(coefficients)}")
+        return geometry_pb2.DISTORTION_MODEL_KANNALA_BRANDT, coefficients
+    if not any(coefficients):
+        return geometry_pb2.DISTORTION_MODEL_UNSPECIFIED, []
+    # The first five coefficients of rational_polynomial are those of plumb_bob.
+    if model not in ("plumb_bob", "rational_polynomial") or any(coefficients[5:]):
+        raise ValueError(f"distortion_model '{model}' with the coefficients {coefficients} is not supported")
+    return geometry_pb2.DISTORTION_MODEL_BROWN_CONRADY, coefficients[:5]
 
 
 def measured_odometry(message, base_frame, drift):

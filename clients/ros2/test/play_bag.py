@@ -74,7 +74,9 @@ def image_messages(row, file, camera):
     raw.data = numpy.asarray(picture)[:, :, ::-1].tobytes()
 
     info = stamped(CameraInfo, row, "camera_optical_frame")
-    (info.width, info.height), info.k[0] = picture.size, camera.focal * picture.size[0] / camera.width
+    (info.width, info.height), pixels = picture.size, picture.size[0] / camera.width
+    info.k = [camera.fx * pixels, 0.0, camera.cx * pixels - 0.5, 0.0, camera.fy * pixels, camera.cy * pixels - 0.5,
+              0.0, 0.0, 1.0]
     return compressed, raw, info
 
 

@@ -42,9 +42,37 @@ def test_what_is_no_image_is_said(message, says):
 
 
 def test_a_camera_that_is_not_calibrated_is_none():
-    assert requests.pinhole(CameraInfo(width=640, height=480)) is None
-    camera = requests.pinhole(CameraInfo(width=640, height=480, k=[585.0] + [0.0] * 8))
-    assert (camera.width, camera.height, camera.focal) == (640, 480, 585.0)
+    assert requests.camera(CameraInfo(width=640, height=480)) is None
+
+
+K = [525.0, 0.0, 319.5, 0.0, 530.0, 239.5, 0.0, 0.0, 1.0]
+UNSPECIFIED, BROWN_CONRADY, KANNALA_BRANDT = range(3)
+
+
+@pytest.mark.parametrize(("model", "d", "expected_model", "expected"), [
+    ("", [], UNSPECIFIED, []),
+    ("plumb_bob", [0.0] * 5, UNSPECIFIED, []),
+    ("plumb_bob", [0.1, -0.2, 0.001, -0.002, 0.03], BROWN_CONRADY, [0.1, -0.2, 0.001, -0.002, 0.03]),
+    ("rational_polynomial", [0.1, -0.2, 0.001, -0.002, 0.03, 0.0, 0.0, 0.0], BROWN_CONRADY,
+     [0.1, -0.2, 0.001, -0.002, 0.03]),
+    ("equidistant", [-0.03, 0.01, -0.002, 0.0005], KANNALA_BRANDT, [-0.03, 0.01, -0.002, 0.0005]),
+    ("equidistant", [0.0] * 4, KANNALA_BRANDT, [0.0] * 4),
+])
+def test_a_camera_has_its_center_and_its_distortion(model, d, expected_model, expected):
+    camera = requests.camera(CameraInfo(width=640, height=480, k=K, distortion_model=model, d=d))
+    assert (camera.width, camera.height, camera.fx, camera.fy) == (640, 480, 525.0, 530.0)
+    assert (camera.cx, camera.cy) == (320.0, 240.0)
+    assert (camera.distortion_model, list(camera.distortion)) == (expected_model, expected)
+
+
+@pytest.mark.parametrize(("model", "d"), [
+    ("rational_polynomial", [0.1, -0.2, 0.001, -0.002, 0.03, 0.1, 0.0, 0.0]),
+    ("thin_prism", [0.1]),
+    ("equidistant", [0.1]),
+])
+def test_other_distortions_are_refused(model, d):
+    with pytest.raises(ValueError, match=model):
+        requests.camera(CameraInfo(width=640, height=480, k=K, distortion_model=model, d=d))
 
 
 def imu(seconds, acceleration, orientation=None):

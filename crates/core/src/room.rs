@@ -5,7 +5,7 @@
 
 use std::fmt;
 
-use crate::geometry::{Pinhole, Pose};
+use crate::geometry::{CameraIntrinsics, Pose};
 
 /// Why a room, its name or a reference to one of its frames is refused.
 #[derive(Debug, thiserror::Error, PartialEq)]
@@ -147,7 +147,7 @@ pub struct Provenance {
         feature = "serde",
         serde(default, skip_serializing_if = "Option::is_none")
     )]
-    pub camera: Option<Pinhole>,
+    pub camera: Option<CameraIntrinsics>,
 }
 
 /// The frames of a room as columns, one entry per frame. [`Room::new`] validates them.

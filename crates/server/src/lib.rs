@@ -51,7 +51,7 @@ mod odometry;
 mod encoding;
 
 pub use auth::{AuthError, Keyring};
-pub use convert::{pinhole_to_wire, source_to_wire};
+pub use convert::{camera_to_wire, source_to_wire};
 pub use image_encoder::ImageEncoders;
 pub use metrics::Metrics;
 pub use reload::Reload;

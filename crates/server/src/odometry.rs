@@ -147,7 +147,7 @@ fn by_two_views(
     cancel: &Cancellation,
 ) -> Result<Option<pb::EstimateMotionResponse>, Error> {
     // Check a given camera for both estimators.
-    let stated = request.camera.as_ref().map(convert::pinhole).transpose()?;
+    let stated = request.camera.as_ref().map(convert::camera).transpose()?;
 
     let (Some(reader), Some(first), Some(second), "") = (
         snapshot.two_views(),

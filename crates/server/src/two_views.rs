@@ -5,7 +5,7 @@ use ndarray::Array3;
 use super::image_encoder::{ImageEncoder, ImageEncoders};
 use super::{Error, RunError};
 use seese3_core::cancel::Cancellation;
-use seese3_core::geometry::Pinhole;
+use seese3_core::geometry::CameraIntrinsics;
 use seese3_encoder::{Encoder, Layer, ModelTask, Pooling, recipe};
 use seese3_robot::two_view::{self, MotionEstimate};
 
@@ -89,7 +89,7 @@ impl TwoViewReader {
         &self,
         first: &[u8],
         second: &[u8],
-        camera: &Pinhole,
+        camera: &CameraIntrinsics,
         cancel: &Cancellation,
     ) -> Result<MotionEstimate, Error> {
         let map = |field: &str, image: &[u8]| {

@@ -7,7 +7,7 @@ use super::photograph::{Shot, photograph};
 use super::render::{Camera, Sampling, radiance};
 use super::solid::Solid;
 use super::{FRAMES_PER_SECOND, Light, Scene, render};
-use seese3_core::geometry::{Pinhole, PinholeError, PixelCamera, Pose};
+use seese3_core::geometry::{CameraError, CameraIntrinsics, Distortion, PixelCamera, Pose};
 use seese3_core::image::RgbImage;
 
 /// Field of view of a camera without variation: the middle of the range of 55° to 80°.
@@ -150,15 +150,17 @@ impl Film {
     /// The camera for images of this size.
     ///
     /// # Errors
-    /// [`PinholeError`] for an image that is much taller than wide.
-    pub fn camera(&self, width: usize, height: usize) -> Result<Pinhole, PinholeError> {
+    /// [`CameraError`] for an image that is much taller than wide.
+    pub fn camera(&self, width: usize, height: usize) -> Result<CameraIntrinsics, CameraError> {
         let width = width as f64;
+        let focal = 0.5 * width / (self.field_of_view_rad / 2.0).tan();
 
-        Pinhole::new(PixelCamera {
+        CameraIntrinsics::new(PixelCamera {
             width,
             height: height as f64,
-            focal: 0.5 * width / (self.field_of_view_rad / 2.0).tan(),
-            centre: None,
+            focal: [focal, focal].into(),
+            center: None,
+            distortion: Distortion::None,
         })
     }
 

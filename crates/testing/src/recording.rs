@@ -2,7 +2,7 @@
 
 use seese3_core::adapter::{Adapter, Preset, TrainingRecord};
 use seese3_core::features::{FeatureSource, Features};
-use seese3_core::geometry::{Pinhole, PixelCamera};
+use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera};
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
@@ -24,11 +24,12 @@ pub fn room(name: &str) -> Room {
         images_root: "/recordings/a".to_owned(),
         worst_rotation_deviation: 1e-4,
         camera: Some(
-            Pinhole::new(PixelCamera {
+            CameraIntrinsics::new(PixelCamera {
                 width: 640.0,
                 height: 480.0,
-                focal: 585.0,
-                centre: Some([330.0, 250.0].into()),
+                focal: [525.0, 526.0].into(),
+                center: Some([330.0, 250.0].into()),
+                distortion: Distortion::BrownConrady([0.1, -0.2, 0.001, -0.002, 0.03]),
             })
             .unwrap(),
         ),

@@ -4,7 +4,7 @@ use std::sync::LazyLock;
 
 use seese3_core::adapter::{Adapter, Preset, TrainingRecord};
 use seese3_core::features::{FeatureSource, Features};
-use seese3_core::geometry::{Pinhole, PixelCamera, Pose};
+use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera, Pose};
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
@@ -55,11 +55,12 @@ pub fn place(name: &str, seed: u64) -> (Room, Features) {
     let camera = PixelCamera {
         width: 640.0,
         height: 480.0,
-        focal: 585.0,
-        centre: None,
+        focal: [585.0, 585.0].into(),
+        center: None,
+        distortion: Distortion::None,
     };
     let provenance = Provenance {
-        camera: Some(Pinhole::new(camera).unwrap()),
+        camera: Some(CameraIntrinsics::new(camera).unwrap()),
         ..Provenance::default()
     };
     let room = Room::new(RoomId::new(name).unwrap(), frames, provenance).unwrap();

@@ -67,6 +67,15 @@ pub enum Distortion {
 }
 
 impl Distortion {
+    /// Brown–Conrady distortion, [`Self::None`] if all coefficients are 0.
+    pub fn brown_conrady(coefficients: [f64; 5]) -> Self {
+        if coefficients == [0.0; 5] {
+            Self::None
+        } else {
+            Self::BrownConrady(coefficients)
+        }
+    }
+
     /// The coefficients in their order.
     pub fn coefficients(&self) -> &[f64] {
         match self {
@@ -415,9 +424,7 @@ impl CameraIntrinsics {
                 return false;
             };
             (0..=STEPS).all(|step| {
-                let (_, derivative) = self
-                    .distortion
-                    .distort(end * (step as f64 / STEPS as f64));
+                let (_, derivative) = self.distortion.distort(end * (step as f64 / STEPS as f64));
                 derivative.determinant() > 0.0
             })
         })
@@ -473,9 +480,15 @@ mod tests {
         };
 
         let brown = project(Distortion::BrownConrady([-0.1, 0.02, 0.001, -0.002, 0.003]));
-        assert!((brown - Vector2::new(0.295_463_38, -0.197_018_92)).norm() < 1e-6, "{brown}");
+        assert!(
+            (brown - Vector2::new(0.295_463_38, -0.197_018_92)).norm() < 1e-6,
+            "{brown}"
+        );
         let fisheye = project(Distortion::KannalaBrandt([-0.03, 0.01, -0.002, 0.0005]));
-        assert!((fisheye - Vector2::new(0.286_934_41, -0.191_289_61)).norm() < 1e-6, "{fisheye}");
+        assert!(
+            (fisheye - Vector2::new(0.286_934_41, -0.191_289_61)).norm() < 1e-6,
+            "{fisheye}"
+        );
     }
 
     /// Oracle: the definition of an inverse, over the whole image.

@@ -10,16 +10,14 @@
 
 mod camera;
 mod given_pose;
-mod pinhole;
 mod pose_error;
 mod rotation;
 mod se3;
 
-pub use camera::{CameraError, CameraIntrinsics, Distortion, PixelCamera as CameraInPixels};
+pub use camera::{CameraError, CameraIntrinsics, Distortion, PixelCamera};
 pub use given_pose::{
     GivenPoseError, MAX_ROTATION_DEVIATION, pose_from_matrix, pose_from_quaternion,
 };
-pub use pinhole::{Pinhole, PinholeError, PixelCamera};
 pub use pose_error::PoseError;
 pub use rotation::{NearestRotation, nearest_rotation};
 pub use se3::{Twist, adjoint, body_twist, exp, left_jacobian_inverse, log};

@@ -23,7 +23,7 @@ use super::{
 };
 use seese3_core::Cause;
 use seese3_core::features::{FeatureSource, Features};
-use seese3_core::geometry::{Pinhole, PixelCamera};
+use seese3_core::geometry::CameraIntrinsics;
 use seese3_core::room::Room;
 
 const FORMAT: &str = "seese3 bundle 1";
@@ -49,10 +49,9 @@ struct Bundle {
     sequences: Vec<u32>,
     held_out: Vec<bool>,
     worst_rotation_deviation: f64,
-    /// The camera's focal length, the height of its images and its principal point (x, y), all in
-    /// image widths, if known.
+    /// The camera, in image widths, if known.
     #[serde(default)]
-    camera: Option<[f64; 4]>,
+    camera: Option<CameraIntrinsics>,
     /// The source of each `features_NAME.npy`.
     features: Vec<FeatureSource>,
 }
@@ -157,18 +156,6 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
 
     check_lengths(&file, &recording)?;
 
-    let camera = camera
-        .map(|[focal, height, x, y]| {
-            Pinhole::new(PixelCamera {
-                width: 1.0,
-                height,
-                focal,
-                centre: Some([x, y].into()),
-            })
-        })
-        .transpose()
-        .map_err(|error| malformed(format!("camera: {error}").into()))?;
-
     recording.stated = Stated {
         name,
         format: recorded_as,
@@ -180,12 +167,6 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
     recording.features = with_sources(read, &features, &file)?;
 
     Ok(recording)
-}
-
-/// The numbers of a camera in `bundle.json`, see [`Bundle::camera`].
-fn stated_camera(camera: Pinhole) -> [f64; 4] {
-    let centre = camera.centre();
-    [camera.focal(), camera.height(), centre.x, centre.y]
 }
 
 /// Replaces the placeholder source of every array by the one in `bundle.json`. The arrays and the
@@ -319,7 +300,7 @@ fn described(room: &Room, features: &[Features]) -> Bundle {
         sequences: frames.sequences.clone(),
         held_out: frames.held_out.clone(),
         worst_rotation_deviation: provenance.worst_rotation_deviation,
-        camera: provenance.camera.map(stated_camera),
+        camera: provenance.camera,
         features: features.iter().map(|set| set.source().clone()).collect(),
     }
 }

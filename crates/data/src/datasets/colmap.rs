@@ -15,7 +15,9 @@ use super::natural::sort_naturally;
 use super::text::number;
 use super::{DropReason, Error, Reader, Recording, read_bytes, read_text};
 use seese3_core::Cause;
-use seese3_core::geometry::{Pinhole, PixelCamera, Pose, pose_from_quaternion};
+use seese3_core::geometry::{
+    CameraIntrinsics, Distortion, PixelCamera, Pose, pose_from_quaternion,
+};
 
 /// Subfolders of a project that are searched for a model.
 const MODELS: [&str; 4] = ["", "sparse/0", "sparse", "0"];
@@ -24,15 +26,8 @@ const IMAGES: [&str; 4] = ["images", "../images", "../../images", "."];
 /// Bytes of an image point in `images.bin`: two coordinates and the id of a 3D point.
 const POINT_BYTES: u64 = 24;
 
-/// A camera of the model.
-#[derive(Debug, Clone, PartialEq)]
-struct Camera {
-    width: f64,
-    height: f64,
-    /// Focal lengths along x and y and principal point, pixels; `None` for fisheye and unknown
-    /// models.
-    pinhole: Option<[f64; 4]>,
-}
+/// The cameras of the model by id; `None` for camera models that [`camera_of`] does not read.
+type Cameras = BTreeMap<u32, Option<PixelCamera>>;
 
 /// An image of the model.
 #[derive(Debug, Clone, PartialEq)]
@@ -162,76 +157,76 @@ fn images_root(model: &Path, given: Option<&Path>, frames: &[Image]) -> Result<P
         })
 }
 
-/// The camera shared by all images, if its two focal lengths differ by less than 5 %. Distortion is
-/// ignored.
-fn one_camera(cameras: &BTreeMap<u32, Camera>, frames: &[Image]) -> Option<Pinhole> {
+/// The camera shared by all images; `None` if they have several cameras, or one that is not valid.
+fn one_camera(cameras: &Cameras, frames: &[Image]) -> Option<CameraIntrinsics> {
     let first = cameras.get(&frames.first()?.camera)?;
     let is_same = |frame: &Image| cameras.get(&frame.camera) == Some(first);
     if !frames.iter().all(is_same) {
         return None;
     }
 
-    let [focal_x, focal_y, x, y] = first.pinhole?;
-    let is_square = (focal_x / focal_y - 1.0).abs() < 0.05;
-    let camera = PixelCamera {
-        width: first.width,
-        height: first.height,
-        focal: focal_x,
-        centre: Some([x, y].into()),
-    };
-    is_square.then(|| Pinhole::new(camera).ok()).flatten()
+    CameraIntrinsics::new((*first)?).ok()
 }
 
-/// The parameter layout of a COLMAP camera model.
-struct Model {
-    name: &'static str,
-    /// Whether the focal lengths along x and y are separate parameters.
-    has_two_focals: bool,
-    /// The number of parameters.
-    numbers: usize,
-}
-
-/// COLMAP's camera models, indexed by model id.
-const CAMERA_MODELS: [Model; 11] = [
-    model("SIMPLE_PINHOLE", false, 3),
-    model("PINHOLE", true, 4),
-    model("SIMPLE_RADIAL", false, 4),
-    model("RADIAL", false, 5),
-    model("OPENCV", true, 8),
-    model("OPENCV_FISHEYE", true, 8),
-    model("FULL_OPENCV", true, 12),
-    model("FOV", true, 5),
-    model("SIMPLE_RADIAL_FISHEYE", false, 4),
-    model("RADIAL_FISHEYE", false, 5),
-    model("THIN_PRISM_FISHEYE", true, 12),
+/// Name and number of parameters of COLMAP's camera models, indexed by model id.
+const CAMERA_MODELS: [(&str, usize); 11] = [
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
 ];
 
-const fn model(name: &'static str, has_two_focals: bool, numbers: usize) -> Model {
-    Model {
-        name,
-        has_two_focals,
-        numbers,
-    }
-}
-
-impl Model {
-    fn camera(&self, width: f64, height: f64, numbers: &[f64]) -> Camera {
-        // A fisheye camera is not a pinhole, although it has a focal length.
-        let is_pinhole = !self.name.contains("FISHEYE") && self.name != "FOV";
-        let pinhole = match *numbers {
-            [x, y, cx, cy, ..] if is_pinhole && self.has_two_focals => Some([x, y, cx, cy]),
-            [focal, cx, cy, ..] if is_pinhole && !self.has_two_focals => {
-                Some([focal, focal, cx, cy])
-            }
-            _ => None,
-        };
-
-        Camera {
-            width,
-            height,
-            pinhole,
+/// The camera of a model's parameters; `None` for models with another kind of distortion.
+fn camera_of(model: &str, width: f64, height: f64, parameters: &[f64]) -> Option<PixelCamera> {
+    let (focal, center, distortion) = match (model, parameters) {
+        ("SIMPLE_PINHOLE", &[f, x, y]) => ([f, f], [x, y], Distortion::None),
+        ("PINHOLE", &[fx, fy, x, y]) => ([fx, fy], [x, y], Distortion::None),
+        ("SIMPLE_RADIAL", &[f, x, y, k1]) => {
+            let lens = Distortion::brown_conrady([k1, 0.0, 0.0, 0.0, 0.0]);
+            ([f, f], [x, y], lens)
         }
-    }
+        ("RADIAL", &[f, x, y, k1, k2]) => {
+            let lens = Distortion::brown_conrady([k1, k2, 0.0, 0.0, 0.0]);
+            ([f, f], [x, y], lens)
+        }
+        ("OPENCV", &[fx, fy, x, y, k1, k2, p1, p2]) => {
+            let lens = Distortion::brown_conrady([k1, k2, p1, p2, 0.0]);
+            ([fx, fy], [x, y], lens)
+        }
+        // The last three coefficients are those of the denominator.
+        ("FULL_OPENCV", &[fx, fy, x, y, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]) => {
+            let lens = Distortion::brown_conrady([k1, k2, p1, p2, k3]);
+            ([fx, fy], [x, y], lens)
+        }
+        ("SIMPLE_RADIAL_FISHEYE", &[f, x, y, k1]) => {
+            let lens = Distortion::KannalaBrandt([k1, 0.0, 0.0, 0.0]);
+            ([f, f], [x, y], lens)
+        }
+        ("RADIAL_FISHEYE", &[f, x, y, k1, k2]) => {
+            let lens = Distortion::KannalaBrandt([k1, k2, 0.0, 0.0]);
+            ([f, f], [x, y], lens)
+        }
+        ("OPENCV_FISHEYE", &[fx, fy, x, y, k1, k2, k3, k4]) => {
+            let lens = Distortion::KannalaBrandt([k1, k2, k3, k4]);
+            ([fx, fy], [x, y], lens)
+        }
+        _ => return None,
+    };
+
+    Some(PixelCamera {
+        width,
+        height,
+        focal: focal.into(),
+        center: Some(center.into()),
+        distortion,
+    })
 }
 
 fn pose(file: &Path, what: &str, numbers: [f64; 7]) -> Result<Pose, Error> {
@@ -244,7 +239,7 @@ fn pose(file: &Path, what: &str, numbers: [f64; 7]) -> Result<Pose, Error> {
     })
 }
 
-fn text_cameras(file: &Path) -> Result<BTreeMap<u32, Camera>, Error> {
+fn text_cameras(file: &Path) -> Result<Cameras, Error> {
     let text = read_text(file)?;
     let mut cameras = BTreeMap::new();
     for (line, row) in (1..).zip(text.lines()) {
@@ -268,29 +263,19 @@ fn text_cameras(file: &Path) -> Result<BTreeMap<u32, Camera>, Error> {
             sizes.iter().map(|word| number(file, line, word)).collect();
         let numbers = numbers?;
 
-        let model = CAMERA_MODELS.iter().find(|model| model.name == name);
         let [width, height, parameters @ ..] = numbers.as_slice() else {
             return Err(wrong("is not ID MODEL WIDTH HEIGHT PARAMETERS".into()));
         };
-        let camera = match model {
-            Some(model) if model.numbers != parameters.len() => {
-                return Err(wrong(
-                    format!(
-                        "has {} parameters, {name} has {}",
-                        parameters.len(),
-                        model.numbers
-                    )
-                    .into(),
-                ));
-            }
-            Some(model) => model.camera(*width, *height, parameters),
-            // An unknown model, from a newer COLMAP: the poses can still be read.
-            None => Camera {
-                width: *width,
-                height: *height,
-                pinhole: None,
-            },
-        };
+        // The poses of an unknown model, from a newer COLMAP, can still be read.
+        let model = CAMERA_MODELS.iter().find(|(model, _)| *model == name);
+        if let Some((_, count)) = model
+            && *count != parameters.len()
+        {
+            return Err(wrong(
+                format!("has {} parameters, {name} has {count}", parameters.len()).into(),
+            ));
+        }
+        let camera = camera_of(name, *width, *height, parameters);
         cameras.insert(id, camera);
     }
 
@@ -404,7 +389,7 @@ impl Bytes<'_> {
     }
 }
 
-fn binary_cameras(file: &Path) -> Result<BTreeMap<u32, Camera>, Error> {
+fn binary_cameras(file: &Path) -> Result<Cameras, Error> {
     let content = read_bytes(file)?;
     let mut bytes = Bytes {
         file,
@@ -420,18 +405,19 @@ fn binary_cameras(file: &Path) -> Result<BTreeMap<u32, Camera>, Error> {
         let height = bytes.u64()? as f64;
 
         // The number of parameters is needed to find the next camera.
-        let model = CAMERA_MODELS
-            .get(kind as usize)
-            .ok_or_else(|| Error::Malformed {
-                file: file.to_owned(),
-                problem: format!(
-                    "camera {id} has the unknown model {kind}; convert the model to text with \
+        let (model, parameter_count) =
+            CAMERA_MODELS
+                .get(kind as usize)
+                .ok_or_else(|| Error::Malformed {
+                    file: file.to_owned(),
+                    problem: format!(
+                        "camera {id} has the unknown model {kind}; convert the model to text with \
                      `colmap model_converter --output_type TXT`"
-                )
-                .into(),
-            })?;
-        let numbers: Result<Vec<f64>, Error> = (0..model.numbers).map(|_| bytes.f64()).collect();
-        cameras.insert(id, model.camera(width, height, &numbers?));
+                    )
+                    .into(),
+                })?;
+        let numbers: Result<Vec<f64>, Error> = (0..*parameter_count).map(|_| bytes.f64()).collect();
+        cameras.insert(id, camera_of(model, width, height, &numbers?));
     }
 
     Ok(cameras)

@@ -13,7 +13,9 @@ use super::collect::{About, Collected};
 use super::text::number;
 use super::{DropReason, Error, Reader, Recording, read_text};
 use seese3_core::Cause;
-use seese3_core::geometry::{Pinhole, PixelCamera, Pose, pose_from_matrix, pose_from_quaternion};
+use seese3_core::geometry::{
+    CameraIntrinsics, Distortion, PixelCamera, Pose, pose_from_matrix, pose_from_quaternion,
+};
 
 /// The longest time between an image and its pose, nanoseconds.
 const MAX_DIFFERENCE_NS: u64 = 10_000_000;
@@ -158,7 +160,7 @@ fn read_images(file: &Path) -> Result<Vec<(i64, String)>, Error> {
 /// A camera's pose on the body, and its intrinsics if the file states them.
 struct Sensor {
     body_from_camera: Pose,
-    camera: Option<Pinhole>,
+    camera: Option<CameraIntrinsics>,
 }
 
 fn read_sensor(file: &Path) -> Result<Sensor, Error> {
@@ -175,23 +177,48 @@ fn read_sensor(file: &Path) -> Result<Sensor, Error> {
     let (body_from_camera, _) = pose_from_matrix(&Matrix4::from_row_slice(&mounting))
         .map_err(|error| malformed(error.into()))?;
 
-    let numbers = list(&text, "resolution:").zip(list(&text, "intrinsics:"));
-    let camera = numbers.and_then(|(size, intrinsics)| {
-        let [width, height] = <[f64; 2]>::try_from(size).ok()?;
-        let [focal, _, x, y] = <[f64; 4]>::try_from(intrinsics).ok()?;
-        let centre = Some([x, y].into());
-        Pinhole::new(PixelCamera {
-            width,
-            height,
-            focal,
-            centre,
-        })
-        .ok()
-    });
     Ok(Sensor {
         body_from_camera,
-        camera,
+        camera: camera_of(&text),
     })
+}
+
+/// The camera; `None` if it is incomplete, not valid, or of another model.
+fn camera_of(text: &str) -> Option<CameraIntrinsics> {
+    if word(text, "camera_model:").is_some_and(|model| model != "pinhole") {
+        return None;
+    }
+    let [width, height] = <[f64; 2]>::try_from(list(text, "resolution:")?).ok()?;
+    let [fx, fy, x, y] = <[f64; 4]>::try_from(list(text, "intrinsics:")?).ok()?;
+
+    let model = word(text, "distortion_model:");
+    let coefficients = list(text, "distortion_coefficients:");
+    let distortion = match (model, coefficients.as_deref()) {
+        (None | Some("none"), None | Some([])) => Distortion::None,
+        (Some("radial-tangential" | "radtan"), Some(&[k1, k2, p1, p2])) => {
+            Distortion::brown_conrady([k1, k2, p1, p2, 0.0])
+        }
+        (Some("equidistant"), Some(&[k1, k2, k3, k4])) => {
+            Distortion::KannalaBrandt([k1, k2, k3, k4])
+        }
+        _ => return None,
+    };
+
+    // The calibration is OpenCV's: the center of the first pixel is at (0, 0).
+    let camera = PixelCamera {
+        width,
+        height,
+        focal: [fx, fy].into(),
+        center: Some([x + 0.5, y + 0.5].into()),
+        distortion,
+    };
+    CameraIntrinsics::new(camera).ok()
+}
+
+/// The text after a key, up to the end of the line or a comment.
+fn word<'a>(text: &'a str, key: &str) -> Option<&'a str> {
+    let after = &text[text.find(key)? + key.len()..];
+    after.split(['\n', '#']).next().map(str::trim)
 }
 
 /// The numbers in the first brackets after a key: not general YAML, only the form of these files.
@@ -215,5 +242,57 @@ mod tests {
         assert_eq!(list(yaml, "T_BS:"), Some(vec![0.0, -1.0, 2.5]));
         assert_eq!(list(yaml, "resolution:"), Some(vec![752.0, 480.0]));
         assert_eq!(list(yaml, "intrinsics:"), None);
+        assert_eq!(word(yaml, "sensor_type:"), Some("camera"));
+        assert_eq!(word(yaml, "camera_model:"), None);
+    }
+
+    fn sensor(distortion: &str) -> String {
+        format!(
+            "resolution: [752, 480]\ncamera_model: pinhole\n\
+             intrinsics: [458.654, 457.296, 367.215, 248.375] #fu, fv, cu, cv\n{distortion}"
+        )
+    }
+
+    /// Oracle: the numbers of cam0 in the published recordings, in pixels whose centers are at
+    /// whole numbers, by hand.
+    #[test]
+    fn the_published_calibration_is_read() {
+        let text = sensor(
+            "distortion_model: radial-tangential\n\
+             distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]\n",
+        );
+        let camera = PixelCamera {
+            width: 752.0,
+            height: 480.0,
+            focal: [458.654, 457.296].into(),
+            center: Some([367.715, 248.875].into()),
+            distortion: Distortion::BrownConrady([
+                -0.283_408_11,
+                0.073_959_07,
+                0.000_193_59,
+                1.761_871_14e-5,
+                0.0,
+            ]),
+        };
+        assert_eq!(camera_of(&text), CameraIntrinsics::new(camera).ok());
+    }
+
+    /// Oracle: by hand.
+    #[test]
+    fn other_lenses_are_read_or_left_out() {
+        let lens = |text: &str| camera_of(&sensor(text)).map(|camera| camera.distortion());
+        assert_eq!(lens(""), Some(Distortion::None));
+        assert_eq!(
+            lens(
+                "distortion_model: equidistant\n\
+                 distortion_coefficients: [0.003, 0.0007, -0.002, 0.0002]"
+            ),
+            Some(Distortion::KannalaBrandt([0.003, 0.0007, -0.002, 0.0002]))
+        );
+        assert_eq!(
+            lens("distortion_model: fov\ndistortion_coefficients: [0.9]"),
+            None
+        );
+        assert_eq!(camera_of(&sensor("").replace("pinhole", "omni")), None);
     }
 }

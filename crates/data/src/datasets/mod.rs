@@ -44,7 +44,7 @@ use std::path::{Path, PathBuf};
 
 use seese3_core::Cause;
 use seese3_core::features::Features;
-use seese3_core::geometry::Pinhole;
+use seese3_core::geometry::CameraIntrinsics;
 use seese3_core::room::{Frames, Timeline};
 
 /// Why a recording cannot be read. Every message names the file or the folder.
@@ -168,8 +168,8 @@ pub struct Stated {
     pub format: String,
     /// The recording's license.
     pub licence: String,
-    /// The pinhole camera of all images; `None` if unknown, or if images have different cameras.
-    pub camera: Option<Pinhole>,
+    /// The camera of all images; `None` if unknown, or if images have different cameras.
+    pub camera: Option<CameraIntrinsics>,
 }
 
 impl Recording {

@@ -14,7 +14,7 @@ use super::natural::sort_naturally;
 use super::{DropReason, Error, Reader, Recording, read_bytes};
 use crate::pose_check::{Axes, Convention};
 use seese3_core::Cause;
-use seese3_core::geometry::{Pinhole, PixelCamera};
+use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera};
 
 /// The parts of the file that are read.
 #[derive(Debug, Deserialize)]
@@ -27,8 +27,11 @@ struct Transforms {
 /// The camera's parameters, pixels. Any of them may be missing.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 struct Camera {
-    /// If missing, the camera is taken as OPENCV. Distortion coefficients are ignored.
+    /// If missing, the camera is taken as OPENCV.
     camera_model: Option<String>,
+    /// How instant-ngp states the model OPENCV_FISHEYE.
+    #[serde(default)]
+    is_fisheye: bool,
     w: Option<f64>,
     h: Option<f64>,
     fl_x: Option<f64>,
@@ -37,6 +40,19 @@ struct Camera {
     cy: Option<f64>,
     /// The horizontal field of view, radians. The original NeRF files have it in place of `fl_x`.
     camera_angle_x: Option<f64>,
+    #[serde(default)]
+    k1: f64,
+    #[serde(default)]
+    k2: f64,
+    #[serde(default)]
+    k3: f64,
+    /// A coefficient of OPENCV_FISHEYE only.
+    #[serde(default)]
+    k4: f64,
+    #[serde(default)]
+    p1: f64,
+    #[serde(default)]
+    p2: f64,
 }
 
 #[derive(Debug, Deserialize)]
@@ -103,7 +119,7 @@ pub fn read_transforms(path: &Path, reader: &mut Reader<'_>) -> Result<Recording
         *pose = opengl.to_world_from_camera(pose);
     }
     recording.stated.camera =
-        pinhole(transforms.camera).map_err(|problem| malformed(problem.into()))?;
+        intrinsics(&transforms.camera).map_err(|problem| malformed(problem.into()))?;
     Ok(recording)
 }
 
@@ -115,34 +131,51 @@ fn image_of(folder: &Path, name: &str) -> Option<String> {
         .find(|image| folder.join(image).is_file())
 }
 
-/// The pinhole camera, if the file states it once for all frames. `None` if size or focal length is
-/// missing, for other models such as fisheye, and if the two focal lengths differ by 2 % or more.
-fn pinhole(camera: Camera) -> Result<Option<Pinhole>, String> {
-    let is_pinhole = match camera.camera_model.as_deref() {
-        None | Some("OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL") => true,
-        Some(_) => false,
-    };
-    let is_square = match camera.fl_x.zip(camera.fl_y) {
-        Some((x, y)) => (y / x - 1.0).abs() < 0.02,
-        None => true,
-    };
-    if !is_pinhole || !is_square {
+/// The camera, if the file states it once for all frames. `None` if size or focal length is
+/// missing, and for other models, such as panoramas.
+fn intrinsics(camera: &Camera) -> Result<Option<CameraIntrinsics>, String> {
+    let size = camera.w.zip(camera.h);
+    let (Some((width, height)), Some(distortion)) = (size, distortion(camera)) else {
         return Ok(None);
-    }
+    };
 
-    let Some((width, height)) = camera.w.zip(camera.h) else {
-        return Ok(None);
-    };
     let by_angle = |angle: f64| width / (2.0 * (angle / 2.0).tan());
-    let Some(focal) = camera.fl_x.or(camera.camera_angle_x.map(by_angle)) else {
+    let Some(fx) = camera.fl_x.or(camera.camera_angle_x.map(by_angle)) else {
         return Ok(None);
     };
 
-    let pinhole = Pinhole::new(PixelCamera {
+    let intrinsics = CameraIntrinsics::new(PixelCamera {
         width,
         height,
-        focal,
-        centre: camera.cx.zip(camera.cy).map(|(x, y)| [x, y].into()),
+        focal: [fx, camera.fl_y.unwrap_or(fx)].into(),
+        center: camera.cx.zip(camera.cy).map(|(x, y)| [x, y].into()),
+        distortion,
     });
-    pinhole.map(Some).map_err(|error| error.to_string())
+    intrinsics.map(Some).map_err(|error| error.to_string())
+}
+
+/// The lens distortion; `None` for other models.
+fn distortion(camera: &Camera) -> Option<Distortion> {
+    let &Camera {
+        k1,
+        k2,
+        k3,
+        k4,
+        p1,
+        p2,
+        ..
+    } = camera;
+
+    match camera.camera_model.as_deref() {
+        Some("OPENCV_FISHEYE") => Some(Distortion::KannalaBrandt([k1, k2, k3, k4])),
+        None | Some("OPENCV") if camera.is_fisheye => {
+            Some(Distortion::KannalaBrandt([k1, k2, k3, k4]))
+        }
+        None | Some("OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL")
+            if k4 == 0.0 =>
+        {
+            Some(Distortion::brown_conrady([k1, k2, p1, p2, k3]))
+        }
+        _ => None,
+    }
 }

@@ -8,7 +8,7 @@ use super::{
     Verdict, check, is_identity, pairs_to_look_at,
 };
 use crate::image_motion::{SmallImage, align};
-use seese3_core::geometry::{Pinhole, Pose};
+use seese3_core::geometry::{CameraIntrinsics, Pose};
 use seese3_core::image::RgbImage;
 use seese3_core::room::{FrameId, Room};
 
@@ -276,12 +276,14 @@ fn depth_warning(seen: SceneEstimate) -> Option<PoseWarning> {
     Some(PoseWarning::Depth { depth_m, unit })
 }
 
-fn focal_warning(seen: SceneEstimate, camera: Pinhole) -> Option<PoseWarning> {
-    let ratio = seen.focal / camera.focal();
+fn focal_warning(seen: SceneEstimate, camera: CameraIntrinsics) -> Option<PoseWarning> {
+    // The fit assumes square pixels.
+    let stated = camera.focal().x;
+    let ratio = seen.focal / stated;
     let is_usual = (FOCAL_FACTOR.recip()..FOCAL_FACTOR).contains(&ratio);
-    (!is_usual).then(|| PoseWarning::Focal {
+    (!is_usual).then_some(PoseWarning::Focal {
         fitted: seen.focal,
-        stated: camera.focal(),
+        stated,
     })
 }
 

@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use seese3_core::features::{FeatureSource, Features};
-use seese3_core::geometry::{Pinhole, PixelCamera};
+use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera};
 use seese3_core::room::{Provenance, Room, RoomId};
 use seese3_data::datasets::{
     Error, Reader, Recording, SevenScenes, Unusable, read_arkitscenes, read_bundle, read_numpy,
@@ -378,11 +378,12 @@ fn exported(out: &Path) -> (Room, Features) {
         images_root: found.images_root.clone(),
         worst_rotation_deviation: found.worst_rotation_deviation,
         camera: Some(
-            Pinhole::new(PixelCamera {
+            CameraIntrinsics::new(PixelCamera {
                 width: 640.0,
                 height: 480.0,
-                focal: 585.0,
-                centre: Some([330.0, 250.0].into()),
+                focal: [525.0, 526.0].into(),
+                center: Some([330.0, 250.0].into()),
+                distortion: Distortion::BrownConrady([0.1, -0.2, 0.001, -0.002, 0.03]),
             })
             .unwrap(),
         ),
@@ -447,6 +448,7 @@ fn an_exported_room_comes_back_whole() {
     );
 
     assert_eq!(back.images_root, room.provenance().images_root);
+    assert_eq!(back.stated.camera, room.provenance().camera);
 
     for (a, b) in back.frames.poses.iter().zip(room.poses()) {
         assert!((a.to_homogeneous() - b.to_homogeneous()).amax() < 1e-14);

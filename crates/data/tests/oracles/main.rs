@@ -9,6 +9,7 @@
 
 #[cfg(feature = "bags")]
 mod bags;
+mod cameras;
 mod datasets;
 mod more_datasets;
 mod pose_check;

@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use nalgebra::Matrix4;
-use seese3_core::geometry::{Pinhole, PixelCamera};
+use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera};
 use seese3_data::datasets::{
     DropReason, Error, Kitti, Reader, Recording, Unusable, read_colmap, read_euroc, read_folder,
     read_kitti, read_transforms,
@@ -50,15 +50,16 @@ fn has_poses(found: &Recording, count: usize) {
     }
 }
 
-/// The camera of all these files.
-fn camera() -> Pinhole {
+/// A camera of these files.
+fn camera(center: [f64; 2], distortion: Distortion) -> CameraIntrinsics {
     let camera = PixelCamera {
         width: 8.0,
         height: 6.0,
-        focal: 7.5,
-        centre: Some([4.0, 3.0].into()),
+        focal: [7.5, 7.5].into(),
+        center: Some(center.into()),
+        distortion,
     };
-    Pinhole::new(camera).unwrap()
+    CameraIntrinsics::new(camera).unwrap()
 }
 
 /// Oracle: the poses from which COLMAP's own library wrote both models.
@@ -71,7 +72,8 @@ fn colmap_models_are_read_in_both_forms() {
         let found = lenient(|reader| read_colmap(&folder(model), images.as_deref(), reader));
         let found = found.unwrap();
         has_poses(&found, 5);
-        assert_eq!(found.stated.camera, Some(camera()));
+        let lens = Distortion::BrownConrady([0.01, 0.0, 0.0, 0.0, 0.0]);
+        assert_eq!(found.stated.camera, Some(camera([4.0, 3.0], lens)));
         assert_eq!(
             found.frames.images,
             [
@@ -126,7 +128,8 @@ fn transforms_are_turned_and_sorted() {
     for path in ["transforms", "transforms/transforms.json"] {
         let found = lenient(|reader| read_transforms(&folder(path), reader)).unwrap();
         has_poses(&found, 6);
-        assert_eq!(found.stated.camera, Some(camera()));
+        let stated = camera([4.0, 3.0], Distortion::None);
+        assert_eq!(found.stated.camera, Some(stated));
         let images: Vec<String> = (8..14).map(|n| format!("images/f{n}.png")).collect();
         assert_eq!(found.frames.images, images);
     }
@@ -164,7 +167,9 @@ fn euroc_poses_are_those_of_the_camera() {
     for path in ["euroc", "euroc/mav0"] {
         let found = lenient(|reader| read_euroc(&folder(path), "cam0", reader)).unwrap();
         has_poses(&found, 5);
-        assert_eq!(found.stated.camera, Some(camera()));
+        // EuRoC's center of the first pixel is at (0, 0).
+        let stated = camera([4.5, 3.5], Distortion::None);
+        assert_eq!(found.stated.camera, Some(stated));
         assert_eq!(found.frames.timestamps_ns[1], 1_000_000_000_050_000_000);
         assert_eq!(found.dropped[0].reason, DropReason::NoPoseWithinTolerance);
     }

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use seese3_core::adapter::Adapter;
 use seese3_core::features::Features;
-use seese3_core::geometry::{Pinhole, PoseError, Twist, exp, log};
+use seese3_core::geometry::{CameraIntrinsics, PoseError, Twist, exp, log};
 use seese3_core::nalgebra::Cholesky;
 use seese3_core::room::Room;
 use seese3_core::splits::Pair;
@@ -57,7 +57,7 @@ pub struct Maps<'a> {
     /// Channels, rows and columns of a map; their product is the feature width.
     pub shape: [usize; 3],
     /// The camera that took the images.
-    pub camera: Pinhole,
+    pub camera: CameraIntrinsics,
 }
 
 /// Estimates the motion between the frames of every pair. `on_pair_read` is called after each pair

@@ -4,7 +4,7 @@ use nalgebra::Vector2;
 use ndarray::{Array2, ArrayView3, Axis};
 
 use super::Match;
-use seese3_core::geometry::Pinhole;
+use seese3_core::geometry::CameraIntrinsics;
 
 /// Standard deviation of a match with reference margin and curvature, in image widths: 0.8 of 320
 /// pixels.
@@ -32,7 +32,7 @@ struct Cells {
 pub(super) fn matches(
     first: ArrayView3<'_, f32>,
     second: ArrayView3<'_, f32>,
-    camera: &Pinhole,
+    camera: &CameraIntrinsics,
 ) -> Vec<Match> {
     let cells = Cells {
         rows: first.shape()[1],
@@ -65,7 +65,7 @@ pub(super) fn matches(
             Some(Match {
                 direction: camera.to_image_plane(at).push(1.0),
                 point: camera.to_image_plane(middle(peak.column, peak.row)),
-                deviation: DEVIATION * peak.factor() / camera.focal(),
+                deviation: DEVIATION * peak.factor() / camera.focal().x,
                 is_sharp: peak.factor() <= SHARP,
             })
         })

@@ -21,7 +21,7 @@ mod solver;
 use nalgebra::{Matrix6, Vector2, Vector3};
 use ndarray::ArrayView3;
 
-use seese3_core::geometry::{Pinhole, Pose, Twist, log};
+use seese3_core::geometry::{CameraIntrinsics, Pose, Twist, log};
 
 /// Why two feature maps are rejected.
 #[derive(Debug, thiserror::Error, PartialEq)]
@@ -104,7 +104,7 @@ struct Match {
 pub fn read(
     first: ArrayView3<'_, f32>,
     second: ArrayView3<'_, f32>,
-    camera: &Pinhole,
+    camera: &CameraIntrinsics,
 ) -> Result<MotionEstimate, Error> {
     let shape = |map: &ArrayView3<'_, f32>| [map.shape()[0], map.shape()[1], map.shape()[2]];
     let [first_shape, second_shape] = [shape(&first), shape(&second)];
@@ -154,7 +154,7 @@ mod tests {
     use ndarray::Array3;
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
-    use seese3_core::geometry::{PixelCamera, exp};
+    use seese3_core::geometry::{Distortion, PixelCamera, exp};
 
     /// 400 matches under a known motion, at depths of 1.2 to 3.2 m. `noise` is added on the image
     /// plane; every seventh match is an outlier if `is_wrong`.
@@ -190,12 +190,13 @@ mod tests {
     }
 
     /// A 4:3 camera with a focal length of one image width.
-    fn camera() -> Pinhole {
-        Pinhole::new(PixelCamera {
+    fn camera() -> CameraIntrinsics {
+        CameraIntrinsics::new(PixelCamera {
             width: 320.0,
             height: 240.0,
-            focal: 320.0,
-            centre: None,
+            focal: Vector2::new(320.0, 320.0),
+            center: None,
+            distortion: Distortion::None,
         })
         .unwrap()
     }
@@ -305,11 +306,12 @@ mod tests {
     /// shift by 3 rows is 3/24 of the height, which is 9/16 of the width.
     #[test]
     fn cells_need_not_be_square() {
-        let wide = Pinhole::new(PixelCamera {
+        let wide = CameraIntrinsics::new(PixelCamera {
             width: 1_600.0,
             height: 900.0,
-            focal: 1_600.0,
-            centre: None,
+            focal: Vector2::new(1_600.0, 1_600.0),
+            center: None,
+            distortion: Distortion::None,
         })
         .unwrap();
         let first = random_map(5);

@@ -266,7 +266,7 @@ fn room(snapshot: &Snapshot, served: &ServedRoom) -> pb::Room {
         licence: provenance.licence.clone(),
         worst_rotation_deviation: provenance.worst_rotation_deviation,
         create_time: convert::time_to_wire(created),
-        camera: provenance.camera.as_ref().map(convert::pinhole_to_wire),
+        camera: provenance.camera.as_ref().map(convert::camera_to_wire),
     }
 }
 

@@ -523,7 +523,7 @@ fn finished(
         camera: upload
             .camera
             .as_ref()
-            .map(convert::pinhole)
+            .map(convert::camera)
             .transpose()
             .map_err(|error| error.within("room"))?,
     };

@@ -8,7 +8,7 @@ use super::super::snapshot::Snapshot;
 use super::{CAMERA, world_frame};
 use seese3_client::proto::v1 as pb;
 use seese3_core::eval::{PredictedPair, Prediction, check_thresholds, default_thresholds};
-use seese3_core::geometry::{Pinhole, PixelCamera, Pose, Twist};
+use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera, Pose, Twist};
 use seese3_core::navigation::NavigatorKind;
 use seese3_core::navigation::{
     Displacement, FitOn, MAX_TRANSLATION_M, Mode, Query, Reading, RetrievalMetric, Source,
@@ -76,28 +76,72 @@ pub fn pose(pose: pb::Pose, room: &str) -> Result<Pose, Error> {
     Ok(pose)
 }
 
-/// Pinhole intrinsics in pixels; the principal point defaults to the image center.
+/// Camera intrinsics; the principal point defaults to the image center.
 ///
 /// # Errors
-/// [`Error::Invalid`] on `camera` if the intrinsics are not valid.
-pub fn pinhole(camera: &pb::Pinhole) -> Result<Pinhole, Error> {
-    let pb::Pinhole {
+/// [`Error::Invalid`] on `camera`, or on its field of the distortion, if the intrinsics are not
+/// valid.
+pub fn camera(camera: &pb::CameraIntrinsics) -> Result<CameraIntrinsics, Error> {
+    let &pb::CameraIntrinsics {
         width,
         height,
-        focal,
-        centre_x,
-        centre_y,
-    } = *camera;
-    let middle = [width / 2.0, height / 2.0];
-    let centre = [centre_x.unwrap_or(middle[0]), centre_y.unwrap_or(middle[1])];
+        fx,
+        fy,
+        cx,
+        cy,
+        distortion_model,
+        distortion: ref coefficients,
+    } = camera;
+    let fy = if fy == 0.0 { fx } else { fy };
+    let center = [cx.unwrap_or(width / 2.0), cy.unwrap_or(height / 2.0)];
 
-    Pinhole::new(PixelCamera {
+    CameraIntrinsics::new(PixelCamera {
         width,
         height,
-        focal,
-        centre: Some(centre.into()),
+        focal: [fx, fy].into(),
+        center: Some(center.into()),
+        distortion: distortion(distortion_model, coefficients)
+            .map_err(|error| error.within("camera"))?,
     })
     .map_err(|problem| Error::invalid("camera", problem))
+}
+
+/// The lens distortion of a model and its coefficients.
+fn distortion(model: i32, coefficients: &[f64]) -> Result<Distortion, Error> {
+    let count = coefficients.len();
+    match pb::DistortionModel::try_from(model) {
+        Ok(pb::DistortionModel::Unspecified) if count == 0 => Ok(Distortion::None),
+        Ok(pb::DistortionModel::Unspecified) => Err(Error::invalid(
+            "distortion_model",
+            "is required with distortion coefficients",
+        )),
+        Ok(pb::DistortionModel::BrownConrady) => {
+            let mut padded = [0.0; 5];
+            let given = padded.get_mut(..count).ok_or_else(|| {
+                Error::invalid(
+                    "distortion",
+                    format!(
+                        "has {count} coefficients; Brown–Conrady takes at most 5: k1, k2, p1, p2, k3"
+                    ),
+                )
+            })?;
+            given.copy_from_slice(coefficients);
+            Ok(Distortion::brown_conrady(padded))
+        }
+        Ok(pb::DistortionModel::KannalaBrandt) => coefficients
+            .try_into()
+            .map(Distortion::KannalaBrandt)
+            .map_err(|_| {
+                Error::invalid(
+                    "distortion",
+                    format!("has {count} coefficients; Kannala–Brandt takes 4: k1, k2, k3, k4"),
+                )
+            }),
+        Err(_) => Err(Error::invalid(
+            "distortion_model",
+            format!("{model} is not known to this server"),
+        )),
+    }
 }
 
 /// A view as the source of a query to `adapter`. Encodes images. `field` is the view's field in the

@@ -8,7 +8,7 @@ use seese3_client::proto::v1 as pb;
 use seese3_core::adapter::Adapter;
 use seese3_core::eval::{RetrievalScores, Row};
 use seese3_core::features::FeatureSource;
-use seese3_core::geometry::{Pinhole, Pose, Twist};
+use seese3_core::geometry::{CameraIntrinsics, Distortion, Pose, Twist};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::navigation::NavigatorKind;
 use seese3_core::navigation::{
@@ -168,13 +168,23 @@ pub fn time_to_wire(stated: &str) -> Option<prost_types::Timestamp> {
 }
 
 /// A camera as a wire message, in units of the image width.
-pub fn pinhole_to_wire(camera: &Pinhole) -> pb::Pinhole {
-    pb::Pinhole {
+pub fn camera_to_wire(camera: &CameraIntrinsics) -> pb::CameraIntrinsics {
+    let distortion = camera.distortion();
+    let model = match distortion {
+        Distortion::None => pb::DistortionModel::Unspecified,
+        Distortion::BrownConrady(_) => pb::DistortionModel::BrownConrady,
+        Distortion::KannalaBrandt(_) => pb::DistortionModel::KannalaBrandt,
+    };
+
+    pb::CameraIntrinsics {
         width: 1.0,
         height: camera.height(),
-        focal: camera.focal(),
-        centre_x: Some(camera.centre().x),
-        centre_y: Some(camera.centre().y),
+        fx: camera.focal().x,
+        fy: camera.focal().y,
+        cx: Some(camera.center().x),
+        cy: Some(camera.center().y),
+        distortion_model: model.into(),
+        distortion: distortion.coefficients().to_vec(),
     }
 }
 

@@ -117,10 +117,10 @@ pub fn settings(
 /// # Errors
 /// [`Error::Invalid`] if the camera is not valid, or no room is left.
 fn with_matching_camera(
-    camera: &pb::Pinhole,
+    camera: &pb::CameraIntrinsics,
     served: Vec<Arc<ServedNavigator>>,
 ) -> Result<Vec<Arc<ServedNavigator>>, Error> {
-    let camera = convert::pinhole(camera)?;
+    let camera = convert::camera(camera)?;
     let mut other = None;
     let mut alike = Vec::new();
 

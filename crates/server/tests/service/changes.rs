@@ -182,11 +182,11 @@ async fn unfit_uploads_are_refused_and_leave_nothing() {
         (|u| u.spec.licence = "x".repeat(2_000), "room.licence"),
         (
             |u| {
-                u.spec.camera = Some(pb::Pinhole {
+                u.spec.camera = Some(pb::CameraIntrinsics {
                     width: 640.0,
                     height: 480.0,
-                    focal: f64::NAN,
-                    ..pb::Pinhole::default()
+                    fx: f64::NAN,
+                    ..pb::CameraIntrinsics::default()
                 });
             },
             "room.camera",

@@ -269,7 +269,7 @@ async fn localize_names_the_field() {
 /// Oracle: as above.
 #[tokio::test]
 async fn estimate_motion_names_the_field() {
-    let invalid: [Case<pb::EstimateMotionRequest>; 4] = [
+    let invalid: [Case<pb::EstimateMotionRequest>; 5] = [
         ("no first", |_| (), "first"),
         ("frames without a room", |r| r.first = frame(1), "room"),
         (
@@ -278,14 +278,29 @@ async fn estimate_motion_names_the_field() {
             |r| {
                 r.first = feature(feature_row(1));
                 r.second = feature(feature_row(2));
-                r.camera = Some(pb::Pinhole {
+                r.camera = Some(pb::CameraIntrinsics {
                     width: 640.0,
                     height: 480.0,
-                    focal: 0.914,
-                    ..pb::Pinhole::default()
+                    fx: 0.914,
+                    ..pb::CameraIntrinsics::default()
                 });
             },
             "camera",
+        ),
+        (
+            "coefficients without a model",
+            |r| {
+                r.first = feature(feature_row(1));
+                r.second = feature(feature_row(2));
+                r.camera = Some(pb::CameraIntrinsics {
+                    width: 640.0,
+                    height: 480.0,
+                    fx: 525.0,
+                    distortion: vec![0.1],
+                    ..pb::CameraIntrinsics::default()
+                });
+            },
+            "camera.distortion_model",
         ),
         (
             "narrow second",

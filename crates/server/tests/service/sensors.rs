@@ -404,7 +404,7 @@ async fn rigs_that_are_none_are_refused() {
         ),
         (
             vec![pb::RigCamera {
-                camera: Some(pb::Pinhole::default()),
+                camera: Some(pb::CameraIntrinsics::default()),
                 ..named("a")
             }],
             "config.other_cameras[0].camera",

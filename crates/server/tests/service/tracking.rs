@@ -6,7 +6,7 @@ use seese3_client::convert;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::track_request::Message;
 use seese3_client::proto::v1::track_response::Answer;
-use seese3_core::geometry::{Pinhole, PixelCamera, Pose, PoseError};
+use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera, Pose, PoseError};
 use seese3_core::room::{Provenance, Room};
 use seese3_server::{Config, TokenKey};
 use seese3_store::Store;
@@ -431,11 +431,11 @@ async fn a_stream_is_configured_once_and_first() {
     let server = server(KEY).await;
     let with_camera = |focal: f64| {
         begin(pb::TrackConfig {
-            camera: Some(pb::Pinhole {
+            camera: Some(pb::CameraIntrinsics {
                 width: 1280.0,
                 height: 960.0,
-                focal,
-                ..pb::Pinhole::default()
+                fx: focal,
+                ..pb::CameraIntrinsics::default()
             }),
             ..config()
         })
@@ -522,12 +522,13 @@ async fn rooms_that_cannot_be_tracked_in_do_not_stop_a_search() {
         let wide = PixelCamera {
             width: 640.0,
             height: 480.0,
-            focal: 320.0,
-            centre: None,
+            focal: [320.0, 320.0].into(),
+            center: None,
+            distortion: Distortion::None,
         };
         let provenance = match name {
             "attic" => Provenance {
-                camera: Some(Pinhole::new(wide).unwrap()),
+                camera: Some(CameraIntrinsics::new(wide).unwrap()),
                 ..Provenance::default()
             },
             _ => room.provenance().clone(),
@@ -545,11 +546,11 @@ async fn rooms_that_cannot_be_tracked_in_do_not_stop_a_search() {
     let server = start_on(folder, store, Config::default()).await;
 
     let anywhere = pb::TrackConfig {
-        camera: Some(pb::Pinhole {
+        camera: Some(pb::CameraIntrinsics {
             width: 640.0,
             height: 480.0,
-            focal: 585.0,
-            ..pb::Pinhole::default()
+            fx: 585.0,
+            ..pb::CameraIntrinsics::default()
         }),
         ..pb::TrackConfig::default()
     };
