@@ -126,7 +126,7 @@ relocalize
   seese3 relocalize --images before.jpg,now.jpg
   seese3 relocalize --room kitchen --features features.npy --rows 3,4,5
 motion
-  seese3 motion --images a.jpg,b.jpg --camera 640x480,585
+  seese3 motion --images a.jpg,b.jpg --camera 640x480,525
   seese3 motion --room kitchen --from 100 --to 110
 track
   seese3 track --room kitchen --images frames --hz 30 --tum path.tum --mcap run.mcap
