@@ -62,7 +62,7 @@ fn encoder(shared: &Path, kind: RuntimeKind) -> Option<Encoder> {
         layers: vec![layer],
         window: 1,
         keypoints: None,
-            is_prefix_stated: true,
+        is_prefix_stated: true,
     };
 
     Encoder::model(task, &runtime)

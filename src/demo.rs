@@ -106,6 +106,7 @@ impl Demo {
             revision: published.revision,
             created: String::new(),
             features: Vec::new(),
+            keypoints: None,
         };
         let rooms = [(stored, features)];
 

@@ -146,7 +146,12 @@ impl Encode {
         let keypoints = match mapping {
             Some((outputs, camera)) => {
                 let map = self.map(&newest.room, &encoded, camera)?;
-                Some(room_keypoints(map, sources[0].clone(), outputs, &self.model)?)
+                Some(room_keypoints(
+                    map,
+                    sources[0].clone(),
+                    outputs,
+                    &self.model,
+                )?)
             }
             None => None,
         };
@@ -290,7 +295,7 @@ fn say_replaced(stored: &StoredRoom, sources: &[FeatureSource]) {
 
 /// Whether the room has keypoints of the encoder pass that makes these features, mapped with the
 /// room's camera.
-fn has_keypoints(stored: &StoredRoom, feature: &FeatureSource) -> bool {
+pub fn has_keypoints(stored: &StoredRoom, feature: &FeatureSource) -> bool {
     stored.keypoints.as_ref().is_some_and(|keypoints| {
         keypoints.source.feature == *feature
             && Some(keypoints.map.camera) == stored.room.provenance().camera

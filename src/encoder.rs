@@ -9,8 +9,8 @@ use super::named::one_of;
 use super::output::say;
 use seese3_core::features::FeatureSource;
 use seese3_encoder::{
-    self, Encoder, EncoderRecipe, Filter, KeypointOutputs, Layer, ModelTask, Pooling, Preparation, Preprocess,
-    RECIPES, Resize, Runtime, RuntimeKind,
+    self, Encoder, EncoderRecipe, Filter, KeypointOutputs, Layer, ModelTask, Pooling, Preparation,
+    Preprocess, RECIPES, Resize, Runtime, RuntimeKind,
 };
 
 /// Which runtime runs ONNX models, and on how many threads.

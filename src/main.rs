@@ -16,6 +16,7 @@ mod encoders;
 mod export;
 mod manual;
 mod progress;
+mod keypoints;
 #[cfg(feature = "lab")]
 mod protocol;
 mod serve;

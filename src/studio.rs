@@ -10,17 +10,21 @@ use rayon::prelude::*;
 use serde_json::json;
 use strum::VariantArray;
 
-use super::encode::{by_layer, check_names, has, same_poses};
+use super::encode::{by_layer, check_names, has, has_keypoints, same_poses};
 use super::encoder::{EncoderOptions, RuntimeOptions, feature_prefix, say_features};
+use super::keypoints::{map_keypoints, mapping_inputs, room_keypoints};
 use super::named::one_of;
 use super::output::{JsonOutput, check_writable, say, write_file};
 use super::progress::bar;
 use seese3_core::cancel::Cancellation;
 use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
+use seese3_core::keypoints::Keypoints;
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
-use seese3_encoder::{Encoder, Error, OnBadImage, Task, encode_png, encode_room, read_image};
-use seese3_store::{Store, StoredRoom};
+use seese3_encoder::{
+    Encoded, Encoder, Error, OnBadImage, Task, encode_png, encode_room, read_image,
+};
+use seese3_store::{RoomContents, RoomKeypoints, Store, StoredRoom};
 use seese3_studio::{Film, Suite, Variation};
 
 /// Maximum number of rooms on a contact sheet.
@@ -186,11 +190,11 @@ impl Studio {
 
             // A room is complete if it has every feature set with the same source and, with
             // --keep-images, its images.
-            if before
-                .as_ref()
-                .is_some_and(|before| sources.iter().all(|source| has(before, source)))
-                && (images_kept || !self.keep_images)
-            {
+            let is_encoded = |before: &StoredRoom| {
+                sources.iter().all(|source| has(before, source))
+                    && (encoder.keypoint_outputs().is_none() || has_keypoints(before, &sources[0]))
+            };
+            if before.as_ref().is_some_and(is_encoded) && (images_kept || !self.keep_images) {
                 there += 1;
             } else {
                 // Keep the images of an earlier run.
@@ -202,11 +206,16 @@ impl Studio {
                     progress
                         .set_position(u64::from(number) * self.frame_count() as u64 + done as u64);
                 };
-                let rows =
+                let encoded =
                     pool.install(|| self.encode_room(&room, &film, encoder, &spent, &told))?;
-                store
-                    .publish_room(&room, &by_layer(sources, &rows)?)
-                    .await?;
+                let keypoints =
+                    pool.install(|| self.map(&room, encoder, &sources[0], &encoded.keypoints))?;
+                let contents = RoomContents {
+                    room: &room,
+                    features: &by_layer(sources, &encoded.rows)?,
+                    keypoints: keypoints.as_ref(),
+                };
+                store.publish_contents(contents).await?;
 
                 drawn += 1;
                 spent.wall += begun.elapsed();
@@ -297,7 +306,7 @@ impl Studio {
         encoder: &Encoder,
         spent: &Spent,
         told: &(dyn Fn(usize) + Sync),
-    ) -> anyhow::Result<ndarray::Array2<f32>> {
+    ) -> anyhow::Result<Encoded> {
         let (width, height) = encoder.render_size();
 
         let image = |row: usize| -> Result<RgbImage, Error> {
@@ -329,7 +338,23 @@ impl Studio {
             cancel: &cancel,
         };
 
-        Ok(encode_room(&task, encoder, None, told)?.rows)
+        Ok(encode_room(&task, encoder, None, told)?)
+    }
+
+    /// Triangulates the keypoints of a room, if the encoder detects them.
+    fn map(
+        &self,
+        room: &Room,
+        encoder: &Encoder,
+        feature: &FeatureSource,
+        keypoints: &[Keypoints],
+    ) -> anyhow::Result<Option<RoomKeypoints>> {
+        let camera = room.provenance().camera;
+        let Some((outputs, camera)) = mapping_inputs(encoder, camera, room.id().as_str())? else {
+            return Ok(None);
+        };
+        let map = map_keypoints(room.poses(), keypoints, camera)?;
+        room_keypoints(map, feature.clone(), outputs, &self.encode).map(Some)
     }
 
     fn keep(&self, room: &Room, row: usize, drawn: &RgbImage) -> Result<(), Error> {

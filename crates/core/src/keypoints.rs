@@ -47,11 +47,7 @@ impl Keypoints {
     ///
     /// # Panics
     /// If the three do not have the same number of rows.
-    pub fn new(
-        points: &[Vector2<f32>],
-        scores: &[f32],
-        descriptors: ArrayView2<'_, f32>,
-    ) -> Self {
+    pub fn new(points: &[Vector2<f32>], scores: &[f32], descriptors: ArrayView2<'_, f32>) -> Self {
         assert_eq!(points.len(), scores.len());
         assert_eq!(points.len(), descriptors.nrows());
 

@@ -117,7 +117,8 @@ impl Journal {
 
         let mut bytes = Vec::new();
         for (number, frame) in frames {
-            let content = postcard::to_allocvec(frame).map_err(|error| io(std::io::Error::other(error)))?;
+            let content =
+                postcard::to_allocvec(frame).map_err(|error| io(std::io::Error::other(error)))?;
             let begin = bytes.len();
             bytes.extend((number as u32).to_le_bytes());
             bytes.extend((content.len() as u32).to_le_bytes());

@@ -66,9 +66,8 @@ impl<'a> KeypointMaps<'a> {
             )
         };
 
-        let map = |output: ArrayViewD<'a, f32>| {
-            output.into_dimensionality::<Ix3>().map_err(|_| wrong())
-        };
+        let map =
+            |output: ArrayViewD<'a, f32>| output.into_dimensionality::<Ix3>().map_err(|_| wrong());
         let maps = Self {
             positions: map(positions)?,
             reliability: map(reliability)?,
@@ -93,7 +92,8 @@ impl<'a> KeypointMaps<'a> {
         let mut found: Vec<(f32, usize, usize)> = local_maxima(probabilities.view())
             .into_iter()
             .map(|(x, y)| {
-                let score = probabilities[(y, x)] * CellWeights::at(x, y, reliability.dim()).mean(reliability);
+                let score = probabilities[(y, x)]
+                    * CellWeights::at(x, y, reliability.dim()).mean(reliability);
                 (score, x, y)
             })
             .collect();
@@ -160,10 +160,8 @@ fn local_maxima(probabilities: ArrayView2<'_, f32>) -> Vec<(usize, usize)> {
                 continue;
             }
 
-            let around = probabilities.slice(ndarray::s![
-                y - REACH..=y + REACH,
-                x - REACH..=x + REACH
-            ]);
+            let around =
+                probabilities.slice(ndarray::s![y - REACH..=y + REACH, x - REACH..=x + REACH]);
             if around.iter().all(|&other| other <= value) {
                 maxima.push((x, y));
             }

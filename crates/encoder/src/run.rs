@@ -429,8 +429,7 @@ mod tests {
         let timeline = Timeline::unbroken(8);
         let encoder = Encoder::builtin();
         let folder = tempfile::tempdir().unwrap();
-        let (mut journal, before) =
-            Journal::open(&folder.path().join("rows"), "k").unwrap();
+        let (mut journal, before) = Journal::open(&folder.path().join("rows"), "k").unwrap();
 
         let cancel = Cancellation::default();
         let task = Task {

@@ -129,7 +129,8 @@ pub fn read_keypoints(
     let is_positive = |value: f64| value.is_finite() && value > 0.0;
     if !is_positive(unit_m) || !is_positive(epipolar_px) {
         return Err(damaged(
-            format!("has a unit of {unit_m} m and an epipolar error of {epipolar_px} pixels").into(),
+            format!("has a unit of {unit_m} m and an epipolar error of {epipolar_px} pixels")
+                .into(),
         ));
     }
 
@@ -170,8 +171,14 @@ pub fn read_keypoints(
     let scale = MOST_INVERSE_DEPTH / f64::from(u16::MAX) / unit_m;
     let steps = f32::from(u8::MAX) / MOST_DEVIATION;
     let [inverse_depths, deviations] = [
-        inverse_depths.iter().map(|&n| (f64::from(n.max(1)) * scale) as f32).collect::<Vec<_>>(),
-        deviations.iter().map(|&n| f32::from(n.max(1)) / steps).collect(),
+        inverse_depths
+            .iter()
+            .map(|&n| (f64::from(n.max(1)) * scale) as f32)
+            .collect::<Vec<_>>(),
+        deviations
+            .iter()
+            .map(|&n| f32::from(n.max(1)) / steps)
+            .collect(),
     ];
 
     let mut frames = Vec::with_capacity(frame_count);

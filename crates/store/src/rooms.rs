@@ -5,10 +5,10 @@ use object_store::path::Path;
 
 use super::format::{FeaturesEntry, RoomBody};
 use super::manifest::{self, ObjectRef, SCHEMA};
-use super::room_keypoints::{KeypointsEntry, RoomKeypoints, keypoints_file, read_keypoints};
 use super::room_files::{
     features_file, frames_file, names_file, read_features, read_frames, read_names,
 };
+use super::room_keypoints::{KeypointsEntry, RoomKeypoints, keypoints_file, read_keypoints};
 use super::{ATTEMPTS, Defaults, Error, Kind, Published, Store, folder_of, revision_path};
 use seese3_core::Cause;
 use seese3_core::adapter::TrainingRecord;

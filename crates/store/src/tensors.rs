@@ -48,8 +48,10 @@ impl TensorWriter {
     }
 
     pub fn u8(&mut self, name: &str, shape: &[usize], values: impl Iterator<Item = u8>) {
-        self.0
-            .insert(name.to_owned(), (Dtype::U8, shape.to_vec(), values.collect()));
+        self.0.insert(
+            name.to_owned(),
+            (Dtype::U8, shape.to_vec(), values.collect()),
+        );
     }
 
     pub fn i8(&mut self, name: &str, shape: &[usize], values: impl Iterator<Item = i8>) {

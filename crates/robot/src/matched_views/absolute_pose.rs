@@ -220,7 +220,11 @@ impl Search {
         Some(cost)
     }
 
-    fn inliers(&self, matches: &[Correspondence], camera_from_world: &Isometry3<f64>) -> Vec<usize> {
+    fn inliers(
+        &self,
+        matches: &[Correspondence],
+        camera_from_world: &Isometry3<f64>,
+    ) -> Vec<usize> {
         let threshold = self.threshold_px * self.threshold_px;
         (0..matches.len())
             .filter(|&place| self.squared_error(&matches[place], camera_from_world) < threshold)
@@ -339,20 +343,16 @@ impl Search {
 
     /// The residual of a match in pixels, and its derivatives; `None` behind the camera.
     fn linearized(&self, match_: &Correspondence, pose: &Pose) -> Option<Linearized> {
-        let seen = pose.inverse_transform_point(&Point3::from(match_.world)).coords;
+        let seen = pose
+            .inverse_transform_point(&Point3::from(match_.world))
+            .coords;
         if seen.z < MIN_DEPTH {
             return None;
         }
 
         let projected = seen.xy() / seen.z;
-        let by_point = Matrix2x3::new(
-            1.0,
-            0.0,
-            -projected.x,
-            0.0,
-            1.0,
-            -projected.y,
-        ) * (self.focal_px / seen.z);
+        let by_point = Matrix2x3::new(1.0, 0.0, -projected.x, 0.0, 1.0, -projected.y)
+            * (self.focal_px / seen.z);
 
         // Under pose · exp(δ), δ = (v, ω), the point moves by −v − ω × p = −v + p × ω.
         let mut by_step = Matrix2x6::zeros();
@@ -441,8 +441,7 @@ impl JointEquations {
             };
             let solved = factors.solve(&frame.mixed.transpose());
             reduced.information += frame.pose.information - frame.mixed * solved;
-            reduced.gradient +=
-                frame.pose.gradient - solved.transpose() * frame.shared_gradient;
+            reduced.gradient += frame.pose.gradient - solved.transpose() * frame.shared_gradient;
         }
 
         reduced

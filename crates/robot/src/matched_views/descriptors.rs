@@ -138,9 +138,7 @@ pub(super) fn mutual_matches(
     best_in_b
         .iter()
         .enumerate()
-        .filter(|&(row, &(column, cosine))| {
-            cosine >= min_cosine && best_in_a[column].0 == row
-        })
+        .filter(|&(row, &(column, cosine))| cosine >= min_cosine && best_in_a[column].0 == row)
         .map(|(row, &(column, _))| (row, column))
         .collect()
 }

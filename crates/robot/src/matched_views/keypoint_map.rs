@@ -219,9 +219,8 @@ impl<'a> Mapping<'a> {
             ..
         } = self.parameters;
         let pose = &self.frames[row].pose;
-        let distance = |a: &Pose, b: &Pose| {
-            (a.translation.vector - b.translation.vector).norm() / self.unit_m
-        };
+        let distance =
+            |a: &Pose, b: &Pose| (a.translation.vector - b.translation.vector).norm() / self.unit_m;
 
         let mut near: Vec<(f64, usize)> = self
             .frames
@@ -268,7 +267,11 @@ fn first_unit(poses: &[Pose]) -> f64 {
         .map(|pose| (pose * Point3::origin() - Point3::from(mean)).norm())
         .collect();
     let median = quantile(&distances, 0.5).unwrap_or(1.0);
-    if median > 0.0 { FIRST_UNIT * median } else { 1.0 }
+    if median > 0.0 {
+        FIRST_UNIT * median
+    } else {
+        1.0
+    }
 }
 
 /// Matched keypoints of nearby frames. `height` is that of the images, in image widths; `unit_m`
@@ -285,11 +288,7 @@ pub fn epipolar_pairs(
 }
 
 /// Image points, image widths, of the mutual matches of two frames.
-fn matched_points(
-    first: &Keypoints,
-    second: &Keypoints,
-    height: f64,
-) -> Vec<[Vector2<f64>; 2]> {
+fn matched_points(first: &Keypoints, second: &Keypoints, height: f64) -> Vec<[Vector2<f64>; 2]> {
     let unit = |keypoints: &Keypoints| {
         let count = keypoints.len().min(EPIPOLAR_CANDIDATES);
         let width = keypoints.descriptor_width();
@@ -317,4 +316,3 @@ fn matched_points(
         .map(|(i, j)| [point(first, i), point(second, j)])
         .collect()
 }
-

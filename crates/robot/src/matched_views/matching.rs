@@ -83,7 +83,11 @@ impl KeypointMap {
         let more = parameters.more_frames.min(candidates.frames.len());
         let wider = query.matched(&candidates.frames[..more], poses, parameters);
         let count = |found: &Option<MatchedView>| found.as_ref().map_or(0, |found| found.inliers);
-        if count(&wider) > count(&found) { wider } else { found }
+        if count(&wider) > count(&found) {
+            wider
+        } else {
+            found
+        }
     }
 }
 
@@ -95,11 +99,7 @@ struct Query<'a> {
 }
 
 impl<'a> Query<'a> {
-    fn new(
-        map: &'a KeypointMap,
-        view: ViewKeypoints<'_>,
-        parameters: &MatchingParameters,
-    ) -> Self {
+    fn new(map: &'a KeypointMap, view: ViewKeypoints<'_>, parameters: &MatchingParameters) -> Self {
         let plane = plane_points(view.keypoints, view.camera, parameters.candidates);
         let mut compressed = map.basis.compress(view.keypoints);
         compressed.truncate(plane.len() * super::COMPRESSED);

@@ -4,7 +4,9 @@
 //! Point (P3P) Solver", ECCV 2018. The distances λ to the points satisfy two quadratic forms; a
 //! combination of the two that factors into planes gives up to four solutions.
 
-use nalgebra::{Isometry3, Matrix3, Rotation3, SymmetricEigen, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{
+    Isometry3, Matrix3, Rotation3, SymmetricEigen, Translation3, UnitQuaternion, Vector3,
+};
 
 /// Newton steps that polish the distances.
 const POLISHING_STEPS: usize = 3;
@@ -225,7 +227,8 @@ fn pose(
     };
 
     let rotation = frame(&seen) * frame(points).try_inverse()?;
-    let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
+    let rotation =
+        UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
     let translation = seen[0] - rotation * points[0];
     let pose = Isometry3::from_parts(Translation3::from(translation), rotation);
 

@@ -136,11 +136,7 @@ impl Seen {
         let z = if ray.z.abs() < 1e-6 { 1e-6 } else { ray.z };
         let projected = ray.xy() / z;
         let slope = (self.shift.xy() - projected * self.shift.z) / z;
-        (
-            (self.point - projected) * focal_px,
-            slope * focal_px,
-            ray.z,
-        )
+        ((self.point - projected) * focal_px, slope * focal_px, ray.z)
     }
 }
 
@@ -243,7 +239,8 @@ impl<'a> View<'a> {
                 }
 
                 let similarity = dot(descriptor, neighbor.keypoints.descriptor(other));
-                let better = |best: Option<(usize, i32)>| best.is_none_or(|(_, of)| similarity > of);
+                let better =
+                    |best: Option<(usize, i32)>| best.is_none_or(|(_, of)| similarity > of);
                 if better(best_in_neighbor[place]) {
                     best_in_neighbor[place] = Some((other, similarity));
                 }

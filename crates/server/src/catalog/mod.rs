@@ -247,7 +247,7 @@ fn room(snapshot: &Snapshot, served: &ServedRoom) -> pb::Room {
         frame_count,
         features,
         keypoints: _,
-            provenance,
+        provenance,
     } = &served.summary;
 
     pb::Room {
