@@ -17,7 +17,7 @@ use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::{CameraIntrinsics, Pose};
 use seese3_core::room::{Room, is_plain_name};
 use seese3_encoder::{Encoded, Encoder, Journal, Kept, OnBadImage, Task, encode_room, read_image};
-use seese3_robot::matched_views::{KeypointMap, MappedKeypoints};
+use seese3_robot::matched_views::{KeypointMap, MappedKeypoints, TrialRecording};
 use seese3_store::{Published, RoomContents, RoomKeypoints, Store, StoredRoom};
 
 /// Maximum number of unreadable images that are listed one by one; further ones are only counted.
@@ -145,7 +145,7 @@ impl Encode {
 
         let keypoints = match mapping {
             Some((outputs, camera)) => {
-                let map = self.map(&newest.room, &encoded, camera)?;
+                let map = self.map(&newest.room, &encoded, sources[0].dim, camera)?;
                 Some(room_keypoints(
                     map,
                     sources[0].clone(),
@@ -201,18 +201,27 @@ impl Encode {
         }))
     }
 
-    /// Triangulates the keypoints of the encoded frames.
+    /// Triangulates the keypoints of the encoded frames. `width` is that of the features by which
+    /// similar frames are retrieved.
     fn map(
         &self,
         room: &Room,
         encoded: &Encoded,
+        width: usize,
         camera: CameraIntrinsics,
     ) -> anyhow::Result<KeypointMap> {
         let poses = room.frames().select(&encoded.good).poses;
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(self.runtime.threads())
             .build()?;
-        pool.install(|| map_keypoints(&poses, &encoded.keypoints, camera))
+        pool.install(|| {
+            map_keypoints(TrialRecording {
+                poses: &poses,
+                keypoints: &encoded.keypoints,
+                features: encoded.rows.slice(ndarray::s![.., ..width]),
+                camera,
+            })
+        })
     }
 
     fn journal_path(&self, key: &str) -> anyhow::Result<PathBuf> {
@@ -306,10 +315,14 @@ pub fn has_keypoints(stored: &StoredRoom, feature: &FeatureSource) -> bool {
 fn say_keypoints(map: &KeypointMap) {
     let count: usize = map.frames.iter().map(MappedKeypoints::len).sum();
     say(format_args!(
-        "mapped {:.0} keypoints a frame, median depth {:.2} m, epipolar error {:.2} pixels of an image 320 wide",
+        "mapped {:.0} keypoints a frame, median depth {:.2} m, epipolar error {:.2} pixels of an image 320 wide; \
+         noise of the map: {:.4} m, {:.2} degrees, depths {:.1} %",
         count as f64 / map.frames.len() as f64,
         map.unit_m,
-        map.epipolar_px
+        map.epipolar_px,
+        map.noise.translation_m,
+        map.noise.rotation_rad.to_degrees(),
+        100.0 * map.noise.log_depth
     ));
 }
 

@@ -37,6 +37,13 @@ impl RuntimeOptions {
         }
     }
 
+    /// A pool of that many threads.
+    pub fn pool(&self) -> Result<rayon::ThreadPool, rayon::ThreadPoolBuildError> {
+        rayon::ThreadPoolBuilder::new()
+            .num_threads(self.threads())
+            .build()
+    }
+
     /// The number of threads, with 0 resolved to the number of cores.
     pub fn threads(&self) -> usize {
         if self.threads > 0 {

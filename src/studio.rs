@@ -19,11 +19,11 @@ use super::progress::bar;
 use seese3_core::cancel::Cancellation;
 use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
-use seese3_core::keypoints::Keypoints;
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_encoder::{
     Encoded, Encoder, Error, OnBadImage, Task, encode_png, encode_room, read_image,
 };
+use seese3_robot::matched_views::TrialRecording;
 use seese3_store::{RoomContents, RoomKeypoints, Store, StoredRoom};
 use seese3_studio::{Film, Suite, Variation};
 
@@ -208,8 +208,7 @@ impl Studio {
                 };
                 let encoded =
                     pool.install(|| self.encode_room(&room, &film, encoder, &spent, &told))?;
-                let keypoints =
-                    pool.install(|| self.map(&room, encoder, &sources[0], &encoded.keypoints))?;
+                let keypoints = pool.install(|| self.map(&room, encoder, &sources[0], &encoded))?;
                 let contents = RoomContents {
                     room: &room,
                     features: &by_layer(sources, &encoded.rows)?,
@@ -347,13 +346,18 @@ impl Studio {
         room: &Room,
         encoder: &Encoder,
         feature: &FeatureSource,
-        keypoints: &[Keypoints],
+        encoded: &Encoded,
     ) -> anyhow::Result<Option<RoomKeypoints>> {
         let camera = room.provenance().camera;
         let Some((outputs, camera)) = mapping_inputs(encoder, camera, room.id().as_str())? else {
             return Ok(None);
         };
-        let map = map_keypoints(room.poses(), keypoints, camera)?;
+        let map = map_keypoints(TrialRecording {
+            poses: room.poses(),
+            keypoints: &encoded.keypoints,
+            features: encoded.rows.slice(ndarray::s![.., ..feature.dim]),
+            camera,
+        })?;
         room_keypoints(map, feature.clone(), outputs, &self.encode).map(Some)
     }
 

@@ -1,16 +1,35 @@
 //! `seese3 evaluate localization`: maps a part of a room and localizes the views of the other part.
 
-use anyhow::bail;
+use std::path::PathBuf;
+use std::time::Instant;
+
+use anyhow::{Context, bail};
 use clap::Args;
 
+use seese3_core::cancel::Cancellation;
 use seese3_core::eval::has_seen;
-use seese3_lab::experiments::localization::{LocalizationProtocol, RuleScores, evaluate};
-use seese3_lab::report::{LocalizationContext, LocalizationJson, localization_table};
-
-use super::super::fit::fitting_bar;
-use super::super::output::{JsonOutput, say};
+use seese3_core::features::Features;
+use seese3_core::room::FrameId;
+use seese3_core::splits::HoldOut;
 use seese3_core::training::RoomData;
-use seese3_store::Store;
+use seese3_lab::experiments::localization::{LocalizationProtocol, RuleScores, evaluate};
+use seese3_lab::experiments::matched_localization::{self, MappedAndAsked, MatchedLocalization};
+use seese3_lab::report::{
+    LocalizationContext, LocalizationJson, localization_table, matched_localization_table,
+};
+use seese3_robot::matched_views::TrialRecording;
+
+use super::super::encoder::RuntimeOptions;
+use super::super::fit::fitting_bar;
+use super::super::named::one_of;
+use super::super::output::{JsonOutput, say};
+use super::super::progress::bar;
+use super::room_images::{RoomImages, keypoint_model};
+use seese3_encoder::{Encoded, Encoder, OnBadImage, Task, encode_room};
+use seese3_store::{RoomKeypoints, Store, StoredRoom};
+
+/// Frames per run of the model.
+const BATCH: usize = 8;
 
 #[derive(Debug, Args)]
 pub struct Localization {
@@ -21,10 +40,11 @@ pub struct Localization {
     #[arg(long)]
     room: String,
     /// Pre-trained adapter of other rooms: evaluated zero-shot and, with --fit, the initial weights
-    /// of the fitted adapter
+    /// of the fitted adapter. Without --adapter and --fit, matched views are evaluated, which need
+    /// a room with keypoints
     #[arg(long)]
     adapter: Option<String>,
-    /// Name of the feature set; by default that of the adapter, or the room's only one
+    /// Name of the feature set of the adapter; by default the one it was trained on
     #[arg(long)]
     features: Option<String>,
     /// Also fit an adapter to the mapped frames only, with rules that are measured on them
@@ -37,9 +57,20 @@ pub struct Localization {
     /// views of these blocks
     #[arg(long)]
     map_blocks: bool,
+    /// Choose the mapped frames by a hold-out instead of --map-every; matched views only
+    #[arg(long, value_parser = one_of::<HoldOut>(), conflicts_with_all = ["map_every", "map_blocks", "adapter", "fit"])]
+    hold_out: Option<HoldOut>,
+    /// ONNX file of the encoder with keypoints; by default the file that the room was encoded with
+    #[arg(long, value_name = "FILE")]
+    model: Option<PathBuf>,
+    /// Folder of the images; by default that of the import. Rooms of `seese3 studio` are drawn again
+    #[arg(long, value_name = "DIR")]
+    images: Option<PathBuf>,
     /// Seed of the fitted adapter
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
     seed: u64,
+    #[command(flatten)]
+    runtime: RuntimeOptions,
     #[command(flatten)]
     json: JsonOutput,
 }
@@ -47,11 +78,11 @@ pub struct Localization {
 impl Localization {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
+        let store = Store::open(&self.store)?;
         if self.adapter.is_none() && !self.fit {
-            bail!("give --adapter, or --fit to fit one to the mapped frames");
+            return self.evaluate_matched(&store).await;
         }
 
-        let store = Store::open(&self.store)?;
         let stored_adapter = match &self.adapter {
             Some(name) => Some(store.load_adapter(name, None).await?),
             None => None,
@@ -77,45 +108,142 @@ impl Localization {
             revision: stored.revision,
             features: &features,
         };
-        let protocol = LocalizationProtocol {
-            map_every: self.map_every as usize,
-            withhold_blocks: self.map_blocks,
-            seed: self.seed,
-        };
+        let protocol = self.protocol();
 
         let progress = fitting_bar(self.fit);
         let adapter = stored_adapter.as_ref().map(|stored| &stored.adapter);
         let found = evaluate(&data, adapter, self.fit, &protocol, &|_| progress.inc(1))?;
         progress.finish_and_clear();
 
-        say(format_args!(
-            "room '{}' revision {}, features '{}': {} frames mapped, {} views localized",
-            self.room,
-            stored.revision,
-            features.source().name,
-            found.mapped,
-            found.asked
-        ));
+        self.say_room(&stored, &features, found.mapped, found.asked);
         say(localization_table(&found));
 
         if let Some(rules) = &found.rules {
             say_rules(rules);
         }
 
-        if self.json.is_wanted() {
-            let protocol = LocalizationContext {
-                room: self.room.clone(),
-                features: features.source().name.clone(),
-                adapter: self.adapter.clone(),
-                map_every: protocol.map_every,
-                map_blocks: self.map_blocks,
-                seed: self.seed,
-            };
-            let found = &found;
-            self.json.write(&LocalizationJson { found, protocol })?;
+        self.write(&features, &found)
+    }
+
+    /// Evaluates matched views.
+    async fn evaluate_matched(&self, store: &Store) -> anyhow::Result<()> {
+        let stored = store.load_room(&self.room, None).await?;
+        let Some(keypoints) = &stored.keypoints else {
+            bail!(
+                "room '{}' has no keypoints: encode it with `seese3 encode --recipe xfeat-keypoints`, or give --adapter \
+                 or --fit",
+                self.room
+            );
+        };
+        let features = stored.features(&keypoints.source.feature.name);
+        let features = features.context("the room's keypoints have no features")?;
+
+        let encoded = self.encode(&stored, keypoints)?;
+        let (mapped, asked) = self.frames(&stored);
+        let recording = TrialRecording {
+            poses: stored.room.poses(),
+            keypoints: &encoded.keypoints,
+            features: encoded.rows.view(),
+            camera: keypoints.map.camera,
+        };
+
+        let progress = bar(asked.len() as u64, "localizing");
+        let begun = Instant::now();
+        let frames = MappedAndAsked {
+            mapped: &mapped,
+            asked: &asked,
+        };
+        let found = self.runtime.pool()?.install(|| {
+            let clock = || begun.elapsed().as_secs_f64();
+            matched_localization::evaluate(recording, frames, &clock, &|| progress.inc(1))
+        })?;
+        progress.finish_and_clear();
+
+        self.say_room(&stored, features, found.mapped, found.all.n);
+        say(matched_localization_table(&found));
+        self.write::<MatchedLocalization>(features, &found)
+    }
+
+    /// Features and keypoints of all frames of the room, from its images.
+    fn encode(&self, stored: &StoredRoom, keypoints: &RoomKeypoints) -> anyhow::Result<Encoded> {
+        let source = &keypoints.source;
+        let model = keypoint_model(self.model.as_deref(), &source.model_file)?;
+        let models = [model.to_string_lossy().into_owned()];
+        let encoder = Encoder::of_keypoints(source, &models, &self.runtime.runtime())?;
+        let Some(encoder) = encoder else {
+            bail!(
+                "room '{}' was encoded by '{}', but {} is another model",
+                self.room,
+                source.feature.encoder,
+                model.display()
+            );
+        };
+
+        let size = encoder.render_size();
+        let images = RoomImages::of(&stored.room, self.images.as_deref(), size)?;
+        let progress = bar(stored.room.frame_count() as u64, "encoding");
+        let told = |done: usize| progress.set_position(done as u64);
+        let task = Task {
+            timeline: stored.room.timeline(),
+            image: &|row| images.image(row),
+            batch: BATCH,
+            on_bad: OnBadImage::Stop,
+            cancel: &Cancellation::default(),
+        };
+
+        let encoded = self
+            .runtime
+            .pool()?
+            .install(|| encode_room(&task, &encoder, None, &told))?;
+        progress.finish_and_clear();
+        Ok(encoded)
+    }
+
+    /// The mapped frames, and the frames that are asked for.
+    fn frames(&self, stored: &StoredRoom) -> (Vec<FrameId>, Vec<FrameId>) {
+        let timeline = stored.room.timeline();
+        match self.hold_out {
+            Some(hold_out) => (hold_out.mapped(timeline), hold_out.tracked(timeline)),
+            None => {
+                let protocol = self.protocol();
+                let count = timeline.frame_count;
+                (protocol.mapped(count), protocol.asked(count))
+            }
+        }
+    }
+
+    fn protocol(&self) -> LocalizationProtocol {
+        LocalizationProtocol {
+            map_every: self.map_every as usize,
+            withhold_blocks: self.map_blocks,
+            seed: self.seed,
+        }
+    }
+
+    fn say_room(&self, stored: &StoredRoom, features: &Features, mapped: usize, asked: usize) {
+        say(format_args!(
+            "room '{}' revision {}, features '{}': {mapped} frames mapped, {asked} views localized",
+            self.room,
+            stored.revision,
+            features.source().name,
+        ));
+    }
+
+    fn write<T: serde::Serialize>(&self, features: &Features, found: &T) -> anyhow::Result<()> {
+        if !self.json.is_wanted() {
+            return Ok(());
         }
 
-        Ok(())
+        let protocol = LocalizationContext {
+            room: self.room.clone(),
+            features: features.source().name.clone(),
+            adapter: self.adapter.clone(),
+            hold_out: self.hold_out.map(HoldOut::name),
+            map_every: self.map_every as usize,
+            map_blocks: self.map_blocks,
+            seed: self.seed,
+        };
+        self.json.write(&LocalizationJson { found, protocol })
     }
 }
 

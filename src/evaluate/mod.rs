@@ -6,6 +6,7 @@ mod motion;
 mod odometry;
 mod planning;
 mod robustness;
+mod room_images;
 mod trajectory;
 
 use std::ffi::OsStr;
@@ -49,8 +50,8 @@ pub struct Evaluate {
 enum What {
     /// Track held-out frames of rooms: path errors, covariances, tracking status, relocalization
     Odometry(odometry::Odometry),
-    /// Localize single views in a partly mapped room, by an adapter or one fitted to the mapped
-    /// frames; the baseline is the nearest frame
+    /// Localize single views in a partly mapped room by their keypoints, or by an adapter; the
+    /// baselines are the nearest frame and a blend of three
     Localization(localization::Localization),
     /// Estimate the motion between two views of a room; the baselines are zero motion and the mean
     /// motion

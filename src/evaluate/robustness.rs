@@ -180,7 +180,7 @@ impl DisturbedCamera<'_> {
         room: &TrackedRoom<'_>,
         hold_out: HoldOut,
     ) -> anyhow::Result<DisturbedTracking> {
-        let tracked = hold_out.tracked(room.room().frame_count());
+        let tracked = hold_out.tracked(room.room().timeline());
         let rows: Vec<usize> = tracked.iter().map(|frame| frame.row()).collect();
         let mut features = room.features().select(ndarray::Axis(0), &rows);
         let mut is_blank = vec![false; rows.len()];

@@ -62,7 +62,7 @@ use keypoints::KeypointMaps;
 use seese3_core::Cause;
 use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
-use seese3_core::keypoints::Keypoints;
+use seese3_core::keypoints::{KeypointSource, Keypoints};
 use seese3_core::room::is_plain_name;
 
 /// What can go wrong between an image file and a feature.
@@ -324,6 +324,33 @@ impl Encoder {
         models: &[String],
         runtime: &Runtime,
     ) -> Result<Option<Self>, Error> {
+        Self::rebuilt(source, None, models, runtime)
+    }
+
+    /// Rebuilds the encoder of a room's keypoints and of the features of the same pass, like
+    /// [`Encoder::of_source`].
+    ///
+    /// # Errors
+    /// As [`Encoder::of_source`].
+    pub fn of_keypoints(
+        source: &KeypointSource,
+        models: &[String],
+        runtime: &Runtime,
+    ) -> Result<Option<Self>, Error> {
+        let outputs = KeypointOutputs {
+            positions: source.positions.clone(),
+            reliability: source.reliability.clone(),
+            descriptors: source.descriptors.clone(),
+        };
+        Self::rebuilt(&source.feature, Some(outputs), models, runtime)
+    }
+
+    fn rebuilt(
+        source: &FeatureSource,
+        keypoints: Option<KeypointOutputs>,
+        models: &[String],
+        runtime: &Runtime,
+    ) -> Result<Option<Self>, Error> {
         for model in models {
             let plain = match model.as_str() {
                 "builtin" => Some(Self::builtin()),
@@ -361,7 +388,7 @@ impl Encoder {
                 preparation,
                 layers: vec![layer],
                 window,
-                keypoints: None,
+                keypoints,
                 is_prefix_stated: true,
             };
 

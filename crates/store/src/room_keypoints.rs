@@ -15,7 +15,9 @@ use seese3_core::Cause;
 use seese3_core::geometry::CameraIntrinsics;
 use seese3_core::keypoints::KeypointSource;
 use seese3_core::nalgebra::Vector2;
-use seese3_robot::matched_views::{COMPRESSED, DescriptorBasis, KeypointMap, MappedKeypoints};
+use seese3_robot::matched_views::{
+    COMPRESSED, DescriptorBasis, KeypointMap, MapNoise, MappedKeypoints,
+};
 
 /// Number of steps of a position over the width or the height of an image.
 const POSITION_STEPS: f32 = u16::MAX as f32;
@@ -51,6 +53,8 @@ pub struct KeypointsEntry {
     pub unit_m: f64,
     /// Median epipolar error of the map, pixels of an image 320 wide.
     pub epipolar_px: f64,
+    /// Errors that the points of a mapped frame share.
+    pub noise: MapNoise,
     pub object: ObjectRef,
 }
 
@@ -62,6 +66,7 @@ impl KeypointsEntry {
             camera: map.camera,
             unit_m: map.unit_m,
             epipolar_px: map.epipolar_px,
+            noise: map.noise,
             object,
         }
     }
@@ -124,13 +129,32 @@ pub fn read_keypoints(
         camera,
         unit_m,
         epipolar_px,
+        noise,
         ..
     } = entry;
     let is_positive = |value: f64| value.is_finite() && value > 0.0;
-    if !is_positive(unit_m) || !is_positive(epipolar_px) {
+    let MapNoise {
+        translation_m,
+        rotation_rad,
+        log_depth,
+        translation_growth_m,
+        rotation_growth_rad,
+    } = noise;
+    let numbers = [
+        unit_m,
+        epipolar_px,
+        translation_m,
+        rotation_rad,
+        log_depth,
+        translation_growth_m,
+        rotation_growth_rad,
+    ];
+    if !numbers.into_iter().all(is_positive) {
         return Err(damaged(
-            format!("has a unit of {unit_m} m and an epipolar error of {epipolar_px} pixels")
-                .into(),
+            format!(
+                "unit, epipolar error and noise of the map must be above 0, but are {numbers:?}"
+            )
+            .into(),
         ));
     }
 
@@ -208,6 +232,7 @@ pub fn read_keypoints(
         camera,
         unit_m,
         epipolar_px,
+        noise,
         basis,
         frames,
     };

@@ -2,7 +2,7 @@
 
 use strum::{EnumMessage, EnumString, IntoStaticStr, VariantArray};
 
-use crate::room::FrameId;
+use crate::room::{FrameId, Timeline};
 
 /// Number of blocks of a recording for [`HoldOut::Blocks`].
 const BLOCKS: usize = 20;
@@ -25,6 +25,8 @@ pub enum HoldOut {
     Blocks,
     /// Map the first four fifths, replay the last.
     Time,
+    /// Map the first sequence, replay all others: another visit of the same room.
+    Visit,
 }
 
 impl HoldOut {
@@ -33,9 +35,11 @@ impl HoldOut {
         self.into()
     }
 
-    /// The mapped frames of a recording with `frame_count` frames, in order.
-    pub fn mapped(self, frame_count: usize) -> Vec<FrameId> {
+    /// The mapped frames of a recording, in order.
+    pub fn mapped(self, timeline: &Timeline) -> Vec<FrameId> {
+        let frame_count = timeline.frame_count;
         let is_mapped = |row: &usize| match self {
+            Self::Visit => is_in_first_sequence(*row, timeline),
             Self::Interleaved => row.is_multiple_of(2),
             Self::Blocks => row.is_multiple_of(2) && !is_in_left_out_block(*row, frame_count),
             Self::Time => *row < frame_count * 4 / 5,
@@ -44,10 +48,12 @@ impl HoldOut {
         frames_where(frame_count, is_mapped)
     }
 
-    /// The tracked frames of a recording with `frame_count` frames, in order; disjoint from the
-    /// mapped ones.
-    pub fn tracked(self, frame_count: usize) -> Vec<FrameId> {
+    /// The tracked frames of a recording, in order; disjoint from the mapped ones. Empty for
+    /// [`HoldOut::Visit`] if the recording has one sequence only.
+    pub fn tracked(self, timeline: &Timeline) -> Vec<FrameId> {
+        let frame_count = timeline.frame_count;
         let is_tracked = |row: &usize| match self {
+            Self::Visit => !is_in_first_sequence(*row, timeline),
             Self::Interleaved | Self::Blocks => row % 2 == 1,
             Self::Time => *row >= frame_count * 4 / 5,
         };
@@ -60,9 +66,13 @@ impl HoldOut {
         match self {
             Self::Interleaved => true,
             Self::Blocks => !is_in_left_out_block(frame.row(), frame_count),
-            Self::Time => false,
+            Self::Time | Self::Visit => false,
         }
     }
+}
+
+fn is_in_first_sequence(row: usize, timeline: &Timeline) -> bool {
+    timeline.joins(FrameId(0), FrameId(row as u32))
 }
 
 /// Whether a row is in a held-out block of [`HoldOut::Blocks`].
@@ -85,10 +95,14 @@ mod tests {
     /// Oracle: the definition: mapped and tracked frames are disjoint.
     #[test]
     fn what_is_tracked_is_not_mapped() {
+        let timeline = Timeline {
+            sequences: (0..400).map(|row| u32::from(row >= 200)).collect(),
+            ..Timeline::unbroken(400)
+        };
         for &hold_out in HoldOut::VARIANTS {
             let name = hold_out.name();
-            let mapped = hold_out.mapped(400);
-            let tracked = hold_out.tracked(400);
+            let mapped = hold_out.mapped(&timeline);
+            let tracked = hold_out.tracked(&timeline);
 
             assert!(
                 tracked.iter().all(|frame| !mapped.contains(frame)),
@@ -98,7 +112,11 @@ mod tests {
         }
 
         // With 400 frames a block has 20; the third block is rows 40 to 59.
-        let mapped = HoldOut::Blocks.mapped(400);
+        let mapped = HoldOut::Blocks.mapped(&timeline);
         assert!(!mapped.contains(&FrameId(40)) && mapped.contains(&FrameId(38)));
+
+        let visit = HoldOut::Visit.mapped(&timeline);
+        assert_eq!((visit.len(), visit[199]), (200, FrameId(199)));
+        assert!(HoldOut::Visit.tracked(&Timeline::unbroken(400)).is_empty());
     }
 }

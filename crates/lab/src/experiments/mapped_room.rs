@@ -83,7 +83,7 @@ impl MappedRoom {
         protocol: &PlanningProtocol,
     ) -> Result<Self, Error> {
         let what = || format!("room '{}'", data.room.id());
-        let rows = rows(&protocol.hold_out.mapped(data.room.frame_count()));
+        let rows = rows(&protocol.hold_out.mapped(data.room.timeline()));
         let frames = data.room.frames().select(&rows);
         let room = Room::new(
             data.room.id().clone(),

@@ -6,6 +6,7 @@
 //! - [`adapter_sweep`]: a grid of adapters, one row per run.
 //! - [`cross_room`]: an adapter in held-out rooms.
 //! - [`localization`]: single views in a partly mapped room.
+//! - [`matched_localization`]: single views in a partly mapped room, by their keypoints.
 //! - [`motion`]: motion between two views, compared with simple baselines.
 //! - [`odometry`]: a tracker on held-out frames.
 //! - [`planning`]: paths to a goal, compared with simple planners.
@@ -21,6 +22,7 @@ pub mod folds;
 pub mod formulations;
 pub mod layers;
 pub mod localization;
+pub mod matched_localization;
 pub mod motion;
 pub mod odometry;
 pub mod path_comparison;

@@ -267,7 +267,7 @@ pub fn trackers<'a>(
 ) -> Result<Vec<TrackedRoom<'a>>, Error> {
     let tracker = |data: &RoomData<'a>| {
         let room = Arc::new(data.room.clone());
-        let mapped = protocol.hold_out.mapped(room.frame_count());
+        let mapped = protocol.hold_out.mapped(room.timeline());
         let navigator = Navigator::new(
             room.clone(),
             data.features,
@@ -332,7 +332,7 @@ pub fn relocalisation(
         let mut others = maps.clone();
         others.remove(place);
         let mut found = Relocalisation::default();
-        let tracked = hold_out.tracked(room.room.frame_count());
+        let tracked = hold_out.tracked(room.room.timeline());
 
         for frame in tracked.into_iter().step_by(RELOCALISED_STEP) {
             let feature = room.features.row(frame.row()).to_vec();
@@ -418,7 +418,7 @@ fn room_odometry(
     };
 
     let unknown = own_replay(room, hold_out, InitialPose::Unknown);
-    let tracked = hold_out.tracked(frame_count);
+    let tracked = hold_out.tracked(room.room.timeline());
     let has_mapped_neighbours =
         |row: usize| hold_out.has_mapped_neighbours(tracked[row], frame_count);
 
@@ -428,7 +428,7 @@ fn room_odometry(
             *room.most_alike(room.features.row(tracked[row].row()))
         }),
         format: room.room.provenance().format.clone(),
-        mapped_frames: hold_out.mapped(frame_count).len(),
+        mapped_frames: hold_out.mapped(room.room.timeline()).len(),
         tracked_frames: own.updates.len(),
         paths: PathErrors {
             ape_m: both(0),
@@ -475,7 +475,7 @@ fn own_replay(room: &TrackedRoom<'_>, hold_out: HoldOut, initial_pose: InitialPo
         latents: room.map.navigator().latents(),
         features: Some(room.features),
         poses: room.room.poses(),
-        frames: &hold_out.tracked(room.room.frame_count()),
+        frames: &hold_out.tracked(room.room.timeline()),
     };
 
     replay_streams(&room.tracker, segment, &room.room, initial_pose)
@@ -490,13 +490,13 @@ fn lost_frames(
     own: Option<HoldOut>,
 ) -> LostFrames {
     let own_frames = own.map(|hold_out| {
-        let mut frames = hold_out.tracked(room.room.frame_count());
+        let mut frames = hold_out.tracked(room.room.timeline());
         frames.split_off(frames.len().saturating_sub(OTHER_ROOM_FRAMES))
     });
 
     let mut found = LostFrames::default();
     for other in all.iter().filter(|other| other.room.id() != room.room.id()) {
-        let mut frames = HoldOut::Interleaved.tracked(other.room.frame_count());
+        let mut frames = HoldOut::Interleaved.tracked(other.room.timeline());
         frames.truncate(OTHER_ROOM_FRAMES);
         let theirs = Segment {
             latents: other.map.navigator().latents(),

@@ -234,7 +234,7 @@ pub fn evaluate(
         random.set_stream(place as u64);
         let mut scores: BTreeMap<Planner, PlannerScores> = BTreeMap::new();
 
-        let asked = protocol.hold_out.tracked(data.room.frame_count());
+        let asked = protocol.hold_out.tracked(data.room.timeline());
         for _ in 0..protocol.questions {
             let frame = asked[random.random_range(0..asked.len())];
             let goal = mapped.any_frame(&mut random);

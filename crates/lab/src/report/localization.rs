@@ -7,6 +7,7 @@ use seese3_core::statistics::RecordedMedian;
 
 use super::table::Table;
 use crate::experiments::localization::{Localization, LocalizationErrors};
+use crate::experiments::matched_localization::MatchedLocalization;
 use crate::experiments::motion::{MotionEvaluation, TwoViewErrors};
 
 /// One line per localization method: medians with intervals, and 90 % quantiles of the errors.
@@ -23,6 +24,58 @@ pub fn localization_table(found: &Localization) -> Table {
             ("the adapter's full estimate", found.zero_shot),
             ("the fitted adapter's full estimate", found.fitted),
         ],
+    )
+}
+
+/// One line per method and part of the views: share answered, medians with intervals, 90 % quantiles,
+/// wrong answers and coverage.
+pub fn matched_localization_table(found: &MatchedLocalization) -> String {
+    let mut table = Table::new(
+        "views | located by | answered | median m | 90 % m | median ° | 90 % ° | wrong | 68 % | 95 %",
+    );
+    let parts = [
+        ("all", Some(&found.all)),
+        ("near the map", found.near.as_ref()),
+        ("far from the map", found.far.as_ref()),
+    ];
+
+    for (name, part) in parts {
+        let Some(part) = part else { continue };
+        let ours = &part.ours;
+        let shares = [ours.answered, ours.wrong];
+        let [answered, wrong] = shares.map(|share| format!("{share:.3}"));
+        let cover = [ours.coverage.within_68, ours.coverage.within_95];
+        let [c68, c95] = cover.map(|share| format!("{share:.2}"));
+
+        let label = format!("{name} ({})", part.n);
+        let mut row = |method: &str, errors: &LocalizationErrors, scores: [&str; 4]| {
+            let [answered, wrong, c68, c95] = scores;
+            let cells = [
+                method.to_owned(),
+                answered.to_owned(),
+                interval(&errors.translation_m.median, 4),
+                format!("{:.4}", errors.translation_m.p90),
+                interval(&errors.rotation_deg.median, 2),
+                format!("{:.2}", errors.rotation_deg.p90),
+                wrong.to_owned(),
+                c68.to_owned(),
+                c95.to_owned(),
+            ];
+            table.row(&label, cells);
+        };
+        row(
+            "matched views",
+            &ours.errors,
+            [&answered, &wrong, &c68, &c95],
+        );
+        row("nearest frame", &part.nearest_frame, ["1.000", "", "", ""]);
+        row("blend of three", &part.blend, ["1.000", "", "", ""]);
+    }
+
+    format!(
+        "{table}\nwrong: answers over 0.2 m or 10 degrees off; near the map: a mapped view within 0.25 m and 15 degrees; \
+         RMSE of the answers {:.4} m; {:.1} ms to match a view",
+        found.all.ours.rmse_m, found.match_ms
     )
 }
 
@@ -94,7 +147,9 @@ pub struct LocalizationContext {
     pub features: String,
     /// The name of the adapter trained on other rooms, if one was given.
     pub adapter: Option<String>,
-    /// Stride of the mapped frames.
+    /// The hold-out that chose the mapped frames, if one did.
+    pub hold_out: Option<&'static str>,
+    /// Stride of the mapped frames, without a hold-out.
     pub map_every: usize,
     /// Whether blocks of the recording were left unmapped.
     pub map_blocks: bool,
@@ -104,10 +159,10 @@ pub struct LocalizationContext {
 
 /// The JSON record of `seese3 evaluate localization`.
 #[derive(Debug, Serialize)]
-pub struct LocalizationJson<'a> {
+pub struct LocalizationJson<'a, T> {
     /// The results.
     #[serde(flatten)]
-    pub found: &'a Localization,
+    pub found: &'a T,
     /// What was evaluated.
     pub protocol: LocalizationContext,
 }

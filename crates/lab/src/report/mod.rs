@@ -42,7 +42,8 @@ pub use figure::{Axes, Figure, PathPlot, Series};
 pub use formulations::{add_formulations, formulations_table, spread_text};
 pub use layers::{encoders_table, layers_table};
 pub use localization::{
-    LocalizationContext, LocalizationJson, MotionEvaluationJson, localization_table, motion_table,
+    LocalizationContext, LocalizationJson, MotionEvaluationJson, localization_table,
+    matched_localization_table, motion_table,
 };
 pub use odometry::{
     OdometryJson, coverage_table, odometry_json, odometry_table, other_rooms_text,

@@ -69,7 +69,7 @@ fn disturbed(
     disturbance: Disturbance,
     is_blank: bool,
 ) -> DisturbedTracking {
-    let tracked = HoldOut::Interleaved.tracked(room.room().frame_count());
+    let tracked = HoldOut::Interleaved.tracked(room.room().timeline());
     let rows: Vec<usize> = tracked.iter().map(|frame| frame.row()).collect();
     let features = room.features().select(Axis(0), &rows);
     let views = DisturbedViews {
@@ -110,7 +110,7 @@ fn a_disturbance_is_scored_while_it_is_there() {
     let adapter = Arc::new(calibrated().0);
     let hall = served("hall");
     let rooms = tracked(&hall, &adapter);
-    let tracked = HoldOut::Interleaved.tracked(hall.0.frame_count()).len();
+    let tracked = HoldOut::Interleaved.tracked(hall.0.timeline()).len();
 
     let black = disturbed(&rooms[0], Disturbance::Blank { brightness: 0 }, true);
     assert_eq!(black.noticed_after, Some(1));

@@ -59,7 +59,7 @@ pub fn map_pose_factor(
 
 fn tracker(adapter: &Arc<Adapter>, data: &RoomData<'_>) -> Result<Tracker, Error> {
     let room = Arc::new(data.room.clone());
-    let mapped = HoldOut::Blocks.mapped(data.room.frame_count());
+    let mapped = HoldOut::Blocks.mapped(data.room.timeline());
     let navigator = Navigator::new(room, data.features, adapter.clone(), IndexKind::Exact)?;
     let map = Map::new(Arc::new(navigator), &mapped)?;
     let map = map.with_features(data.features.rows(), &mapped);
@@ -76,7 +76,7 @@ fn replayed_surprises(tracker: &Tracker, data: &RoomData<'_>) -> Vec<f64> {
         latents: tracker.maps()[0].navigator().latents(),
         features: Some(data.features.rows()),
         poses: data.room.poses(),
-        frames: &HoldOut::Blocks.tracked(data.room.frame_count()),
+        frames: &HoldOut::Blocks.tracked(data.room.timeline()),
     };
 
     let replayed = replay_streams(tracker, segment, data.room, InitialPose::Given);

@@ -46,8 +46,8 @@ pub(super) struct Correspondence {
 impl Correspondence {
     /// Derivative of the map point by the errors that all points of its mapped frame share:
     /// translation and rotation of the frame in the axes of the world, logarithm of the depths.
-    fn by_shared_errors(&self) -> Matrix3x7 {
-        let mut by_errors = Matrix3x7::zeros();
+    fn by_shared_errors(&self) -> BySharedErrors {
+        let mut by_errors = BySharedErrors::zeros();
         by_errors
             .fixed_columns_mut::<3>(0)
             .copy_from(&Matrix3::identity());
@@ -59,14 +59,18 @@ impl Correspondence {
     }
 }
 
+/// Number of errors that all points of a mapped frame share.
+const SHARED: usize = 7;
+
 /// Errors that all points of a mapped frame share.
-type Vector7 = SVector<f64, 7>;
-type Matrix3x7 = SMatrix<f64, 3, 7>;
+type SharedErrors = SVector<f64, SHARED>;
+type BySharedErrors = SMatrix<f64, 3, SHARED>;
 
 /// Standard deviations of the errors that all points of a mapped frame share: the error of the
 /// frame's stated pose, and of the scale of its depths, which comes from the poses of its
 /// neighbors.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct MapNoise {
     /// Translation along each axis, meters.
     pub translation_m: f64,
@@ -74,16 +78,33 @@ pub struct MapNoise {
     pub rotation_rad: f64,
     /// Logarithm of the scale of the depths.
     pub log_depth: f64,
+    /// Growth of the translation error of a view with its distance from the matched frames, meters
+    /// per unit of [`PoseInformation::gap`].
+    pub translation_growth_m: f64,
+    /// Growth of the rotation error, radians per unit of [`PoseInformation::gap`].
+    pub rotation_growth_rad: f64,
 }
 
 impl MapNoise {
-    fn information(&self) -> Vector7 {
+    /// Noise of a map in which it was not measured. `unit_m` is the median depth, meters.
+    pub fn typical(unit_m: f64) -> Self {
+        Self {
+            translation_m: 0.003 * unit_m,
+            rotation_rad: 0.003,
+            log_depth: 0.03,
+            translation_growth_m: 0.03 * unit_m,
+            rotation_growth_rad: 0.03,
+        }
+    }
+
+    fn information(&self) -> SharedErrors {
         let Self {
             translation_m: t,
             rotation_rad: r,
             log_depth: s,
+            ..
         } = *self;
-        Vector7::from([t, t, t, r, r, r, s]).map(|deviation| deviation.powi(-2))
+        SharedErrors::from([t, t, t, r, r, r, s]).map(|deviation| deviation.powi(-2))
     }
 }
 
@@ -113,8 +134,8 @@ pub(super) struct Found {
     pub pose: Pose,
     /// Indices of the inliers among the correspondences.
     pub inliers: Vec<usize>,
-    /// Information matrix (inverse covariance) of δ in true = pose · exp(δ), ordered (v, ω).
-    pub information: Matrix6<f64>,
+    /// What the inliers tell about the pose.
+    pub information: PoseInformation,
 }
 
 /// The pose with the most support; `None` if no sample gives a pose.
@@ -269,9 +290,9 @@ impl Search {
     ) -> Option<Found> {
         let inliers = self.inliers(matches, &camera_from_world);
         let mut pose = camera_from_world.inverse();
-        let mut shared: BTreeMap<usize, Vector7> = inliers
+        let mut shared: BTreeMap<usize, SharedErrors> = inliers
             .iter()
-            .map(|&place| (matches[place].frame, Vector7::zeros()))
+            .map(|&place| (matches[place].frame, SharedErrors::zeros()))
             .collect();
 
         for _ in 0..FINAL_STEPS {
@@ -285,7 +306,7 @@ impl Search {
         }
 
         let normal = self.normal_equations(matches, &inliers, &pose, &shared);
-        let information = normal.reduced().information;
+        let information = normal.information(&self.noise);
         let inliers = self.inliers(matches, &pose.inverse());
         Some(Found {
             pose,
@@ -299,7 +320,7 @@ impl Search {
         matches: &[Correspondence],
         inliers: &[usize],
         pose: &Pose,
-        shared: &BTreeMap<usize, Vector7>,
+        shared: &BTreeMap<usize, SharedErrors>,
     ) -> JointEquations {
         let prior = self.noise.information();
         let mut frames: BTreeMap<usize, FrameEquations> = shared
@@ -402,13 +423,13 @@ impl NormalEquations {
 /// the frame's points share.
 struct FrameEquations {
     pose: NormalEquations,
-    mixed: SMatrix<f64, 6, 7>,
-    shared: SMatrix<f64, 7, 7>,
-    shared_gradient: Vector7,
+    mixed: SMatrix<f64, 6, SHARED>,
+    shared: SMatrix<f64, SHARED, SHARED>,
+    shared_gradient: SharedErrors,
 }
 
 impl FrameEquations {
-    fn prior(information: &Vector7, errors: &Vector7) -> Self {
+    fn prior(information: &SharedErrors, errors: &SharedErrors) -> Self {
         Self {
             pose: NormalEquations::default(),
             mixed: SMatrix::zeros(),
@@ -417,12 +438,58 @@ impl FrameEquations {
         }
     }
 
-    fn add(&mut self, row: &Linearized, by_shared: &SMatrix<f64, 2, 7>, weight: &Matrix2<f64>) {
+    fn add(
+        &mut self,
+        row: &Linearized,
+        by_shared: &SMatrix<f64, 2, SHARED>,
+        weight: &Matrix2<f64>,
+    ) {
         self.pose.add(row, weight);
         let weighted = by_shared.transpose() * weight;
         self.shared += weighted * by_shared;
         self.shared_gradient += weighted * row.residual;
         self.mixed += row.by_step.transpose() * weight * by_shared;
+    }
+}
+
+/// Information of the matches of one mapped frame about δ in true = pose · exp(δ), ordered (v, ω),
+/// and about the errors that the frame's points share.
+#[derive(Debug, Clone, PartialEq)]
+struct FrameInformation {
+    pose: Matrix6<f64>,
+    mixed: SMatrix<f64, 6, SHARED>,
+    shared: SMatrix<f64, SHARED, SHARED>,
+}
+
+/// Information of a view's matches about its pose, for any noise of the map.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PoseInformation {
+    frames: Vec<FrameInformation>,
+    /// Distance of the view from the nearest matched frame, in units (median depths) plus radians.
+    pub gap: f64,
+}
+
+impl PoseInformation {
+    /// Covariance of δ in true = pose · exp(δ), ordered (v, ω), meters and radians, where the true
+    /// pose is stated with the same noise as the poses of the map; `None` if the matches do not
+    /// determine the pose.
+    pub fn covariance(&self, noise: &MapNoise) -> Option<Matrix6<f64>> {
+        let prior = SMatrix::<f64, SHARED, SHARED>::from_diagonal(&noise.information());
+        let mut information = Matrix6::zeros();
+        for frame in &self.frames {
+            let factors = Cholesky::new(frame.shared + prior)?;
+            let solved = factors.solve(&frame.mixed.transpose());
+            information += frame.pose - frame.mixed * solved;
+        }
+
+        // The stated poses drift, and depths err together: both errors grow with the distance from
+        // the matched frames.
+        let variance = |still: f64, growth: f64| still.powi(2) + (growth * self.gap).powi(2);
+        let v = variance(noise.translation_m, noise.translation_growth_m);
+        let w = variance(noise.rotation_rad, noise.rotation_growth_rad);
+        let drift = Matrix6::from_diagonal(&Vector6::new(v, v, v, w, w, w));
+        let covariance = Cholesky::new(information)?.inverse() + drift;
+        Some((covariance + covariance.transpose()) * 0.5)
     }
 }
 
@@ -451,8 +518,22 @@ impl JointEquations {
         self.reduced().step()
     }
 
+    /// The information of the matches alone, without the prior on the shared errors.
+    fn information(&self, noise: &MapNoise) -> PoseInformation {
+        let prior = SMatrix::<f64, SHARED, SHARED>::from_diagonal(&noise.information());
+        let frames = self.frames.values().map(|frame| FrameInformation {
+            pose: frame.pose.information,
+            mixed: frame.mixed,
+            shared: frame.shared - prior,
+        });
+        PoseInformation {
+            frames: frames.collect(),
+            gap: 0.0,
+        }
+    }
+
     /// Adds to the shared errors their steps that belong to a step of the pose.
-    fn update_shared(&self, step: &Vector6<f64>, shared: &mut BTreeMap<usize, Vector7>) {
+    fn update_shared(&self, step: &Vector6<f64>, shared: &mut BTreeMap<usize, SharedErrors>) {
         for (frame, errors) in shared {
             let Some(equations) = self.frames.get(frame) else {
                 continue;

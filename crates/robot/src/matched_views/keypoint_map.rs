@@ -2,8 +2,10 @@
 
 use nalgebra::{Point3, Vector2, Vector3};
 use ndarray::Array2;
+use rayon::prelude::*;
 
 use super::Error;
+use super::absolute_pose::MapNoise;
 use super::descriptors::{COMPRESSED, DescriptorBasis, mutual_matches};
 use super::parameters::MappingParameters;
 use super::triangulation::{PosedKeypoints, pixel_focal, triangulate};
@@ -79,6 +81,8 @@ pub struct KeypointMap {
     /// Median distance of matched keypoints from their epipolar lines, pixels; measures the noise of
     /// the map's poses and of its camera.
     pub epipolar_px: f64,
+    /// Errors that the points of a mapped frame share.
+    pub noise: MapNoise,
     /// Compression of the descriptors.
     pub basis: DescriptorBasis,
     /// Keypoints of each mapped frame, in the order of the frames.
@@ -86,6 +90,12 @@ pub struct KeypointMap {
 }
 
 impl KeypointMap {
+    /// Distance between two camera poses, in units (median depths) plus radians.
+    pub fn gap(&self, a: &Pose, b: &Pose) -> f64 {
+        let between = a.inv_mul(b);
+        between.translation.vector.norm() / self.unit_m + between.rotation.angle()
+    }
+
     /// Largest reprojection error of an inlier, pixels.
     pub fn threshold_px(&self) -> f64 {
         let [least, most] = THRESHOLDS_PX;
@@ -147,7 +157,7 @@ impl<'a> Mapping<'a> {
     }
 
     /// The keypoints of the frame in `row`.
-    pub fn map_frame(&self, row: usize) -> MappedKeypoints {
+    fn map_frame(&self, row: usize) -> MappedKeypoints {
         let frame = &self.frames[row];
         let compressed = self.basis.compress(frame.keypoints);
         let mut mapped = MappedKeypoints::default();
@@ -164,12 +174,22 @@ impl<'a> Mapping<'a> {
         mapped
     }
 
-    /// The map of all frames, in their order, as [`Self::map_frame`] computed them.
-    pub fn finish(self, frames: Vec<MappedKeypoints>) -> KeypointMap {
+    /// Maps all frames, on the threads of the calling rayon pool. `done` is called after each frame.
+    pub fn map(self, done: &(dyn Fn() + Sync)) -> KeypointMap {
+        let frames = (0..self.frames.len())
+            .into_par_iter()
+            .map(|row| {
+                let frame = self.map_frame(row);
+                done();
+                frame
+            })
+            .collect();
+
         KeypointMap {
             camera: self.camera,
             unit_m: self.unit_m,
             epipolar_px: self.epipolar_px,
+            noise: MapNoise::typical(self.unit_m),
             basis: self.basis,
             frames,
         }

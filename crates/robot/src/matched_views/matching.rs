@@ -2,10 +2,10 @@
 
 use std::collections::BTreeSet;
 
-use nalgebra::{Matrix6, Vector2};
+use nalgebra::Vector2;
 use ndarray::Array2;
 
-use super::absolute_pose::{Correspondence, Search, find_pose};
+use super::absolute_pose::{Correspondence, PoseInformation, Search, find_pose};
 use super::descriptors::{mutual_matches, unpacked};
 use super::keypoint_map::KeypointMap;
 use super::parameters::MatchingParameters;
@@ -43,9 +43,8 @@ pub struct MatchedView {
     pub matched: usize,
     /// The mapped frames with inliers, in the map's rows.
     pub frames: Vec<usize>,
-    /// Information matrix (inverse covariance) of δ in true = pose · exp(δ), ordered (v, ω), if
-    /// the errors of all matches were independent.
-    pub information: Matrix6<f64>,
+    /// Information of the matches about the pose.
+    pub information: PoseInformation,
     /// The inliers.
     pub matches: Vec<InlierMatch>,
 }
@@ -146,7 +145,7 @@ impl<'a> Query<'a> {
             focal_px: pixel_focal(&self.map.camera),
             threshold_px: self.map.threshold_px(),
             deviation_px: parameters.deviation_px,
-            noise: parameters.noise,
+            noise: self.map.noise,
             iterations: parameters.iterations,
             miss_probability: parameters.miss_probability,
             seed: SEED,
@@ -170,12 +169,18 @@ impl<'a> Query<'a> {
             })
             .collect();
 
+        let mut information = found.information;
+        information.gap = frames
+            .iter()
+            .map(|&frame| self.map.gap(&poses[frame], &found.pose))
+            .fold(f64::INFINITY, f64::min);
+
         Some(MatchedView {
             pose: found.pose,
             inliers: unique.len(),
             matched: all.len(),
             frames: frames.into_iter().collect(),
-            information: found.information,
+            information,
             matches,
         })
     }

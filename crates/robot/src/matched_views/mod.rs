@@ -10,15 +10,19 @@ mod absolute_pose;
 mod descriptors;
 mod keypoint_map;
 mod matching;
+mod retrieval;
+mod noise;
 mod p3p;
 mod parameters;
 mod triangulation;
 
-pub use absolute_pose::MapNoise;
+pub use absolute_pose::{MapNoise, PoseInformation};
 pub use descriptors::{COMPRESSED, DescriptorBasis};
 pub use keypoint_map::{KeypointMap, MappedKeypoints, Mapping, epipolar_pairs};
 pub use matching::{InlierMatch, MatchedView, PlaceCandidates, ViewKeypoints};
+pub use noise::{Trial, TrialRecording, fitted_noise, squared_length, trials};
 pub use parameters::{MappingParameters, MatchingParameters};
+pub use retrieval::UnitFeatures;
 
 /// Why a keypoint map cannot be computed.
 #[derive(Debug, thiserror::Error, Clone, PartialEq)]

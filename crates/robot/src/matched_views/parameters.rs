@@ -1,6 +1,5 @@
 //! Parameters of matched views. `seese3 evaluate localization` measures what they do.
 
-use super::absolute_pose::MapNoise;
 #[cfg(doc)]
 use seese3_core::epipolar::PIXEL_IMAGE_WIDTH;
 
@@ -62,8 +61,6 @@ pub struct MatchingParameters {
     pub candidates: usize,
     /// Minimum cosine of compressed descriptors.
     pub min_cosine: f32,
-    /// Errors that the points of a mapped frame share.
-    pub noise: MapNoise,
     /// Minimum and maximum number of RANSAC iterations.
     pub iterations: [usize; 2],
     /// Probability that RANSAC stops without an all-inlier sample.
@@ -86,11 +83,6 @@ impl Default for MatchingParameters {
             iterations: [100, 2_000],
             miss_probability: 1e-4,
             deviation_px: 0.7,
-            noise: MapNoise {
-                translation_m: 0.005,
-                rotation_rad: 0.003,
-                log_depth: 0.03,
-            },
             confident_inliers: 150,
             min_inliers: 100,
         }

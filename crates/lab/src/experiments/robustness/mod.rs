@@ -132,7 +132,7 @@ fn down_of(poses: &[Pose]) -> Unit<Vector3<f64>> {
 pub fn streams(room: &TrackedRoom<'_>, hold_out: HoldOut) -> Vec<Vec<FrameId>> {
     let timeline = room.room().timeline();
     hold_out
-        .tracked(timeline.frame_count)
+        .tracked(timeline)
         .chunk_by(|a, b| timeline.joins(*a, *b))
         .map(<[FrameId]>::to_vec)
         .collect()

@@ -1,0 +1,302 @@
+//! Evaluates matched views: maps a part of a room's frames with their keypoints, and locates the
+//! views of the others. Beside it, in the same run, the baselines of retrieval.
+
+use nalgebra::{Quaternion, UnitQuaternion, Vector3, Vector4};
+use ndarray::Axis;
+use rayon::prelude::*;
+use serde::Serialize;
+
+use seese3_core::geometry::{Pose, PoseError, log};
+use seese3_core::keypoints::Keypoints;
+use seese3_core::room::FrameId;
+use seese3_core::statistics::{Coverage, coverage, root_mean_square};
+use seese3_robot::localization::{KeypointQuery, KeypointRoom, NotLocated};
+use seese3_robot::matched_views::{Mapping, MappingParameters, TrialRecording};
+
+use super::Error;
+use super::localization::LocalizationErrors;
+
+/// A view is near the map if a mapped view is within these meters and radians of it.
+const NEAR_M: f64 = 0.25;
+const NEAR_RAD: f64 = 0.261_8;
+/// An answered pose is wrong beyond these meters or radians.
+const WRONG_M: f64 = 0.2;
+const WRONG_RAD: f64 = 0.174_5;
+/// Number of blended frames.
+const BLENDED: usize = 3;
+
+/// The localization of the views of one part of a hold-out.
+#[derive(Debug, Clone, Serialize)]
+pub struct MatchedPart {
+    /// Number of views.
+    pub n: usize,
+    /// Matched views.
+    pub ours: Answered,
+    /// Matched views where they answer, elsewhere the most similar frame.
+    pub ours_or_nearest: LocalizationErrors,
+    /// The pose of the mapped frame with the most similar feature.
+    pub nearest_frame: LocalizationErrors,
+    /// Weighted mean of the three most similar frames.
+    pub blend: LocalizationErrors,
+}
+
+/// Errors of the answered views.
+#[derive(Debug, Clone, Serialize)]
+pub struct Answered {
+    /// Share of the views that are answered.
+    pub answered: f64,
+    /// Errors of the answered views.
+    #[serde(flatten)]
+    pub errors: LocalizationErrors,
+    /// Root mean square of their translation errors, meters.
+    pub rmse_m: f64,
+    /// Share of the answers that are more than 0.2 m or 10° off.
+    pub wrong: f64,
+    /// Shares of the errors within the 68 % and 95 % ellipsoids.
+    #[serde(flatten)]
+    pub coverage: Coverage,
+}
+
+/// The localization of a room's held-out views.
+#[derive(Debug, Clone, Serialize)]
+pub struct MatchedLocalization {
+    /// Number of mapped frames.
+    pub mapped: usize,
+    /// All views.
+    #[serde(flatten)]
+    pub all: MatchedPart,
+    /// Views with a mapped view within 0.25 m and 15°; absent without any.
+    pub near: Option<MatchedPart>,
+    /// The other views; absent without any.
+    pub far: Option<MatchedPart>,
+    /// Median time to match a view and estimate its pose, milliseconds on one core; without the
+    /// encoder.
+    pub match_ms: f64,
+}
+
+/// Which frames are mapped and which are asked for.
+#[derive(Debug, Clone, Copy)]
+pub struct MappedAndAsked<'a> {
+    /// Mapped frames.
+    pub mapped: &'a [FrameId],
+    /// Query frames; none of them is mapped.
+    pub asked: &'a [FrameId],
+}
+
+/// A located or refused view.
+struct View {
+    truth: Pose,
+    located: Result<Located, NotLocated>,
+    nearest: Pose,
+    blend: Pose,
+    is_near: bool,
+    seconds: f64,
+}
+
+struct Located {
+    pose: Pose,
+    /// Squared Mahalanobis length of the error.
+    squared_length: f64,
+}
+
+/// Maps the mapped frames of a recording and locates the asked ones, on the threads of the calling
+/// rayon pool. `clock` gives seconds; `done` is called after each view.
+///
+/// # Errors
+/// [`Error::Input`] if no frame is mapped or asked for, or if no mapped frame has a keypoint.
+pub fn evaluate(
+    recording: TrialRecording<'_>,
+    frames: MappedAndAsked<'_>,
+    clock: &(dyn Fn() -> f64 + Sync),
+    done: &(dyn Fn() + Sync),
+) -> Result<MatchedLocalization, Error> {
+    let MappedAndAsked { mapped, asked } = frames;
+    if mapped.is_empty() || asked.is_empty() {
+        return Err(Error::Input(format!(
+            "{} frames are mapped and {} asked for; both must be above 0",
+            mapped.len(),
+            asked.len()
+        )));
+    }
+
+    let room = mapped_room(recording, mapped)?;
+    let poses: Vec<Pose> = mapped
+        .iter()
+        .map(|frame| recording.poses[frame.row()])
+        .collect();
+
+    let views: Vec<View> = asked
+        .par_iter()
+        .map(|frame| {
+            let view = located(recording, &room, &poses, frame.row(), clock);
+            done();
+            view
+        })
+        .collect();
+
+    let part = |keep: &dyn Fn(&View) -> bool| {
+        let kept: Vec<&View> = views.iter().filter(|view| keep(view)).collect();
+        (!kept.is_empty()).then(|| part_of(&kept))
+    };
+    let seconds: Vec<f64> = views.iter().map(|view| view.seconds).collect();
+    let whole: Vec<&View> = views.iter().collect();
+    Ok(MatchedLocalization {
+        mapped: mapped.len(),
+        all: part_of(&whole),
+        near: part(&|view| view.is_near),
+        far: part(&|view| !view.is_near),
+        match_ms: 1e3 * seese3_core::statistics::median(&seconds),
+    })
+}
+
+/// The room of the mapped frames alone, as `seese3 encode` would map it.
+fn mapped_room(recording: TrialRecording<'_>, mapped: &[FrameId]) -> Result<KeypointRoom, Error> {
+    let rows: Vec<usize> = mapped.iter().map(|frame| frame.row()).collect();
+    let poses: Vec<Pose> = rows.iter().map(|&row| recording.poses[row]).collect();
+    let keypoints: Vec<Keypoints> = rows
+        .iter()
+        .map(|&row| recording.keypoints[row].clone())
+        .collect();
+    let features = recording.features.select(Axis(0), &rows);
+    let known = TrialRecording {
+        poses: &poses,
+        keypoints: &keypoints,
+        features: features.view(),
+        ..recording
+    };
+
+    let mapping = Mapping::new(
+        &poses,
+        &keypoints,
+        recording.camera,
+        MappingParameters::default(),
+    );
+    let mapping = mapping.map_err(|error| Error::Input(error.to_string()))?;
+    let mut map = mapping.map(&|| ());
+    map.measure_noise(known);
+    Ok(KeypointRoom::new(
+        poses.clone(),
+        features.view(),
+        map.into(),
+    ))
+}
+
+fn located(
+    recording: TrialRecording<'_>,
+    room: &KeypointRoom,
+    mapped: &[Pose],
+    row: usize,
+    clock: &(dyn Fn() -> f64 + Sync),
+) -> View {
+    let truth = recording.poses[row];
+    let feature = recording.features.row(row);
+    let similar = room.most_similar(feature, BLENDED);
+
+    let begun = clock();
+    let located = room.locate(KeypointQuery {
+        feature,
+        keypoints: &recording.keypoints[row],
+        camera: &recording.camera,
+    });
+    let seconds = clock() - begun;
+
+    let is_near = mapped.iter().any(|pose| {
+        let error = PoseError::between(&truth, pose);
+        error.translation_m <= NEAR_M && error.rotation_rad <= NEAR_RAD
+    });
+    let located = located.map(|found| {
+        let error = log(&found.pose.pose.inv_mul(&truth)).to_vector();
+        let solved = found
+            .pose
+            .covariance
+            .cholesky()
+            .map(|cholesky| error.dot(&cholesky.solve(&error)));
+        Located {
+            pose: found.pose.pose,
+            squared_length: solved.unwrap_or(f64::INFINITY),
+        }
+    });
+
+    View {
+        truth,
+        located,
+        nearest: mapped[similar[0]],
+        blend: blended(room, mapped, &similar, feature),
+        is_near,
+        seconds,
+    }
+}
+
+/// Mean of the poses of similar frames, weighted by the inverse fourth power of the distance
+/// between unit features.
+fn blended(
+    room: &KeypointRoom,
+    mapped: &[Pose],
+    similar: &[usize],
+    feature: ndarray::ArrayView1<'_, f32>,
+) -> Pose {
+    let weights: Vec<f64> = similar
+        .iter()
+        .map(|&row| {
+            let squared = 2.0 - 2.0 * f64::from(room.similarity(row, feature));
+            squared.max(1e-8).powi(-2)
+        })
+        .collect();
+    let sum: f64 = weights.iter().sum();
+
+    let mut position = Vector3::zeros();
+    let mut rotation = Vector4::zeros();
+    let first = mapped[similar[0]].rotation.into_inner().coords;
+    for (&row, weight) in similar.iter().zip(&weights) {
+        position += mapped[row].translation.vector * (weight / sum);
+        // Quaternions of one hemisphere, so that they add up.
+        let coordinates = mapped[row].rotation.into_inner().coords;
+        rotation += coordinates * (weight * coordinates.dot(&first).signum());
+    }
+
+    let rotation = UnitQuaternion::from_quaternion(Quaternion::from(rotation));
+    Pose::from_parts(position.into(), rotation)
+}
+
+fn part_of(views: &[&View]) -> MatchedPart {
+    let errors_of = |pose: &dyn Fn(&View) -> Pose| {
+        let errors: Vec<PoseError> = views
+            .iter()
+            .map(|view| PoseError::between(&view.truth, &pose(view)))
+            .collect();
+        LocalizationErrors::of(&errors)
+    };
+
+    let answers: Vec<(PoseError, f64)> = views
+        .iter()
+        .filter_map(|view| {
+            let located = view.located.as_ref().ok()?;
+            let error = PoseError::between(&view.truth, &located.pose);
+            Some((error, located.squared_length))
+        })
+        .collect();
+    let errors: Vec<PoseError> = answers.iter().map(|(error, _)| *error).collect();
+    let lengths: Vec<f64> = errors.iter().map(|error| error.translation_m).collect();
+    let squared_lengths: Vec<f64> = answers.iter().map(|(_, squared)| *squared).collect();
+    let wrong = errors
+        .iter()
+        .filter(|error| error.translation_m > WRONG_M || error.rotation_rad > WRONG_RAD)
+        .count();
+
+    MatchedPart {
+        n: views.len(),
+        ours: Answered {
+            answered: answers.len() as f64 / views.len() as f64,
+            errors: LocalizationErrors::of(&errors),
+            rmse_m: root_mean_square(&lengths),
+            wrong: wrong as f64 / answers.len().max(1) as f64,
+            coverage: coverage(&squared_lengths),
+        },
+        ours_or_nearest: errors_of(&|view| match &view.located {
+            Ok(located) => located.pose,
+            Err(_) => view.nearest,
+        }),
+        nearest_frame: errors_of(&|view| view.nearest),
+        blend: errors_of(&|view| view.blend),
+    }
+}
