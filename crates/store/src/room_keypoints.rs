@@ -137,6 +137,7 @@ pub fn read_keypoints(
         translation_m,
         rotation_rad,
         log_depth,
+        design_effect,
         translation_growth_m,
         rotation_growth_rad,
     } = noise;
@@ -146,6 +147,7 @@ pub fn read_keypoints(
         translation_m,
         rotation_rad,
         log_depth,
+        design_effect,
         translation_growth_m,
         rotation_growth_rad,
     ];

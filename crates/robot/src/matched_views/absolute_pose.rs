@@ -78,6 +78,9 @@ pub struct MapNoise {
     pub rotation_rad: f64,
     /// Logarithm of the scale of the depths.
     pub log_depth: f64,
+    /// Factor on the variance of a pose from its matches (design effect): errors of nearby matches
+    /// are correlated.
+    pub design_effect: f64,
     /// Growth of the translation error of a view with its distance from the matched frames, meters
     /// per unit of [`PoseInformation::gap`].
     pub translation_growth_m: f64,
@@ -92,6 +95,7 @@ impl MapNoise {
             translation_m: 0.003 * unit_m,
             rotation_rad: 0.003,
             log_depth: 0.03,
+            design_effect: 4.0,
             translation_growth_m: 0.03 * unit_m,
             rotation_growth_rad: 0.03,
         }
@@ -477,9 +481,10 @@ impl PoseInformation {
         let prior = SMatrix::<f64, SHARED, SHARED>::from_diagonal(&noise.information());
         let mut information = Matrix6::zeros();
         for frame in &self.frames {
-            let factors = Cholesky::new(frame.shared + prior)?;
-            let solved = factors.solve(&frame.mixed.transpose());
-            information += frame.pose - frame.mixed * solved;
+            let share = noise.design_effect.recip();
+            let factors = Cholesky::new(frame.shared * share + prior)?;
+            let mixed = frame.mixed * share;
+            information += frame.pose * share - mixed * factors.solve(&mixed.transpose());
         }
 
         // The stated poses drift, and depths err together: both errors grow with the distance from

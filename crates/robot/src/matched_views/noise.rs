@@ -13,7 +13,7 @@ use seese3_core::geometry::{CameraIntrinsics, Pose, log};
 use seese3_core::keypoints::Keypoints;
 
 /// Number of fitted deviations.
-const PARAMETERS: usize = 5;
+const PARAMETERS: usize = 6;
 /// Number of views of each trial.
 const VIEWS: usize = 80;
 /// Minimum number of trial views from which a noise is fitted.
@@ -175,6 +175,7 @@ pub fn fitted_noise(trials: &[Trial], unit_m: f64) -> Option<MapNoise> {
         log_depth: typical.log_depth * logarithms[2].exp(),
         translation_growth_m: typical.translation_growth_m * logarithms[3].exp(),
         rotation_growth_rad: typical.rotation_growth_rad * logarithms[4].exp(),
+        design_effect: typical.design_effect * logarithms[5].exp(),
     };
     let [least, most] = RANGE.map(f64::ln);
 
