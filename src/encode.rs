@@ -316,13 +316,14 @@ fn say_keypoints(map: &KeypointMap) {
     let count: usize = map.frames.iter().map(MappedKeypoints::len).sum();
     say(format_args!(
         "mapped {:.0} keypoints a frame, median depth {:.2} m, epipolar error {:.2} pixels of an image 320 wide; \
-         noise of the map: {:.4} m, {:.2} degrees, depths {:.1} %",
+         noise of the map: {:.4} m, {:.2} degrees, design effect {:.1}, doubled at a gap of {:.3}",
         count as f64 / map.frames.len() as f64,
         map.unit_m,
         map.epipolar_px,
         map.noise.translation_m,
         map.noise.rotation_rad.to_degrees(),
-        100.0 * map.noise.log_depth
+        map.noise.design_effect,
+        map.noise.gap_scale
     ));
 }
 

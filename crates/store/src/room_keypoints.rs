@@ -53,7 +53,7 @@ pub struct KeypointsEntry {
     pub unit_m: f64,
     /// Median epipolar error of the map, pixels of an image 320 wide.
     pub epipolar_px: f64,
-    /// Errors that the points of a mapped frame share.
+    /// Noise of the map, from which covariances follow.
     pub noise: MapNoise,
     pub object: ObjectRef,
 }
@@ -136,20 +136,16 @@ pub fn read_keypoints(
     let MapNoise {
         translation_m,
         rotation_rad,
-        log_depth,
         design_effect,
-        translation_growth_m,
-        rotation_growth_rad,
+        gap_scale,
     } = noise;
     let numbers = [
         unit_m,
         epipolar_px,
         translation_m,
         rotation_rad,
-        log_depth,
         design_effect,
-        translation_growth_m,
-        rotation_growth_rad,
+        gap_scale,
     ];
     if !numbers.into_iter().all(is_positive) {
         return Err(damaged(

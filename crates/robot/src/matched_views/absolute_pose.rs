@@ -1,11 +1,8 @@
 //! The pose of a camera from matches of image points with map points: LO-RANSAC over P3P, then a
 //! robust refinement.
 
-use std::collections::BTreeMap;
-
 use nalgebra::{
-    Cholesky, Isometry3, Matrix2, Matrix2x3, Matrix2x6, Matrix3, Matrix6, Point3, SMatrix, SVector,
-    Vector2, Vector3, Vector6,
+    Cholesky, Isometry3, Matrix2, Matrix2x3, Matrix2x6, Matrix6, Point3, Vector2, Vector3, Vector6,
 };
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -43,72 +40,35 @@ pub(super) struct Correspondence {
     pub deviation: f64,
 }
 
-impl Correspondence {
-    /// Derivative of the map point by the errors that all points of its mapped frame share:
-    /// translation and rotation of the frame in the axes of the world, logarithm of the depths.
-    fn by_shared_errors(&self) -> BySharedErrors {
-        let mut by_errors = BySharedErrors::zeros();
-        by_errors
-            .fixed_columns_mut::<3>(0)
-            .copy_from(&Matrix3::identity());
-        by_errors
-            .fixed_columns_mut::<3>(3)
-            .copy_from(&-self.from_frame.cross_matrix());
-        by_errors.set_column(6, &self.from_frame);
-        by_errors
-    }
-}
-
-/// Number of errors that all points of a mapped frame share.
-const SHARED: usize = 7;
-
-/// Errors that all points of a mapped frame share.
-type SharedErrors = SVector<f64, SHARED>;
-type BySharedErrors = SMatrix<f64, 3, SHARED>;
-
-/// Standard deviations of the errors that all points of a mapped frame share: the error of the
-/// frame's stated pose, and of the scale of its depths, which comes from the poses of its
-/// neighbors.
+/// Noise of a map, from which the covariance of a view's pose follows:
+///
+/// covariance = H⁻¹ · `design_effect` · (1 + gap / `gap_scale`) + stated noise
+///
+/// H is the information of the matches if their errors were independent. They are not: nearby
+/// points share errors of their depths, and the stated poses of the map drift. The shared part grows
+/// with the gap, the distance of the view from the matched frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct MapNoise {
-    /// Translation along each axis, meters.
+    /// Standard deviation of a stated position along each axis, meters.
     pub translation_m: f64,
-    /// Rotation about each axis, radians.
+    /// Standard deviation of a stated rotation about each axis, radians.
     pub rotation_rad: f64,
-    /// Logarithm of the scale of the depths.
-    pub log_depth: f64,
-    /// Factor on the variance of a pose from its matches (design effect): errors of nearby matches
-    /// are correlated.
+    /// Factor on the variance of independent matches, at a gap of 0.
     pub design_effect: f64,
-    /// Growth of the translation error of a view with its distance from the matched frames, meters
-    /// per unit of [`PoseInformation::gap`].
-    pub translation_growth_m: f64,
-    /// Growth of the rotation error, radians per unit of [`PoseInformation::gap`].
-    pub rotation_growth_rad: f64,
+    /// The gap that doubles that variance, in units (median depths) plus radians.
+    pub gap_scale: f64,
 }
 
 impl MapNoise {
     /// Noise of a map in which it was not measured. `unit_m` is the median depth, meters.
     pub fn typical(unit_m: f64) -> Self {
         Self {
-            translation_m: 0.003 * unit_m,
-            rotation_rad: 0.003,
-            log_depth: 0.03,
-            design_effect: 4.0,
-            translation_growth_m: 0.03 * unit_m,
-            rotation_growth_rad: 0.03,
+            translation_m: 0.001 * unit_m,
+            rotation_rad: 0.001,
+            design_effect: 20.0,
+            gap_scale: 0.1,
         }
-    }
-
-    fn information(&self) -> SharedErrors {
-        let Self {
-            translation_m: t,
-            rotation_rad: r,
-            log_depth: s,
-            ..
-        } = *self;
-        SharedErrors::from([t, t, t, r, r, r, s]).map(|deviation| deviation.powi(-2))
     }
 }
 
@@ -121,8 +81,6 @@ pub(super) struct Search {
     pub threshold_px: f64,
     /// Standard deviation of a keypoint's position, pixels.
     pub deviation_px: f64,
-    /// Errors that the points of a mapped frame share.
-    pub noise: MapNoise,
     /// Minimum and maximum number of iterations.
     pub iterations: [usize; 2],
     /// Probability of stopping without an all-inlier sample.
@@ -138,8 +96,9 @@ pub(super) struct Found {
     pub pose: Pose,
     /// Indices of the inliers among the correspondences.
     pub inliers: Vec<usize>,
-    /// What the inliers tell about the pose.
-    pub information: PoseInformation,
+    /// Information matrix (inverse covariance) of δ in true = pose · exp(δ), ordered (v, ω), if
+    /// the errors of all matches were independent.
+    pub information: Matrix6<f64>,
 }
 
 /// The pose with the most support; `None` if no sample gives a pose.
@@ -285,8 +244,7 @@ impl Search {
     }
 
     /// The refined pose on the inliers of a hypothesis: Student-t weights, with the uncertainty of
-    /// the map points along their rays, and the errors that the points of a mapped frame share
-    /// ([`MapNoise`]) as unknowns with a prior.
+    /// the map points along their rays.
     fn refined(
         &self,
         matches: &[Correspondence],
@@ -294,23 +252,15 @@ impl Search {
     ) -> Option<Found> {
         let inliers = self.inliers(matches, &camera_from_world);
         let mut pose = camera_from_world.inverse();
-        let mut shared: BTreeMap<usize, SharedErrors> = inliers
-            .iter()
-            .map(|&place| (matches[place].frame, SharedErrors::zeros()))
-            .collect();
-
         for _ in 0..FINAL_STEPS {
-            let normal = self.normal_equations(matches, &inliers, &pose, &shared);
-            let step = normal.step()?;
-            normal.update_shared(&step, &mut shared);
+            let step = self.normal_equations(matches, &inliers, &pose).step()?;
             pose *= exp(&Twist::from_vector(&step));
             if step.norm() < 1e-7 {
                 break;
             }
         }
 
-        let normal = self.normal_equations(matches, &inliers, &pose, &shared);
-        let information = normal.information(&self.noise);
+        let information = self.normal_equations(matches, &inliers, &pose).information;
         let inliers = self.inliers(matches, &pose.inverse());
         Some(Found {
             pose,
@@ -324,35 +274,17 @@ impl Search {
         matches: &[Correspondence],
         inliers: &[usize],
         pose: &Pose,
-        shared: &BTreeMap<usize, SharedErrors>,
-    ) -> JointEquations {
-        let prior = self.noise.information();
-        let mut frames: BTreeMap<usize, FrameEquations> = shared
-            .iter()
-            .map(|(&frame, errors)| (frame, FrameEquations::prior(&prior, errors)))
-            .collect();
-
-        let camera_from_world = pose.rotation.inverse();
+    ) -> NormalEquations {
+        let camera_from_world = pose.rotation.inverse().to_rotation_matrix();
+        let mut normal = NormalEquations::default();
         for &place in inliers {
             let match_ = &matches[place];
-            let (Some(errors), Some(equations)) =
-                (shared.get(&match_.frame), frames.get_mut(&match_.frame))
-            else {
-                continue;
-            };
-
-            let by_errors = match_.by_shared_errors();
-            let moved = Correspondence {
-                world: match_.world + by_errors * errors,
-                ..*match_
-            };
-            let Some(row) = self.linearized(&moved, pose) else {
+            let Some(row) = self.linearized(match_, pose) else {
                 continue;
             };
 
             // Position noise of the keypoint, and of the map point along its ray.
-            let by_world = row.by_point * camera_from_world.to_rotation_matrix();
-            let along = by_world * match_.from_frame * match_.deviation;
+            let along = row.by_point * (camera_from_world * match_.from_frame) * match_.deviation;
             let covariance = (Matrix2::identity() + along * along.transpose())
                 * (self.deviation_px * self.deviation_px);
             let Some(inverse) = covariance.try_inverse() else {
@@ -360,10 +292,10 @@ impl Search {
             };
             let squared = row.residual.dot(&(inverse * row.residual));
             let weight = (DEGREES_OF_FREEDOM + 2.0) / (DEGREES_OF_FREEDOM + squared);
-            equations.add(&row, &(by_world * by_errors), &(inverse * weight));
+            normal.add(&row, &(inverse * weight));
         }
 
-        JointEquations { frames }
+        normal
     }
 
     /// The residual of a match in pixels, and its derivatives; `None` behind the camera.
@@ -423,52 +355,12 @@ impl NormalEquations {
     }
 }
 
-/// The part of one mapped frame in the joint normal equations of the pose and of the errors that
-/// the frame's points share.
-struct FrameEquations {
-    pose: NormalEquations,
-    mixed: SMatrix<f64, 6, SHARED>,
-    shared: SMatrix<f64, SHARED, SHARED>,
-    shared_gradient: SharedErrors,
-}
-
-impl FrameEquations {
-    fn prior(information: &SharedErrors, errors: &SharedErrors) -> Self {
-        Self {
-            pose: NormalEquations::default(),
-            mixed: SMatrix::zeros(),
-            shared: SMatrix::from_diagonal(information),
-            shared_gradient: -information.component_mul(errors),
-        }
-    }
-
-    fn add(
-        &mut self,
-        row: &Linearized,
-        by_shared: &SMatrix<f64, 2, SHARED>,
-        weight: &Matrix2<f64>,
-    ) {
-        self.pose.add(row, weight);
-        let weighted = by_shared.transpose() * weight;
-        self.shared += weighted * by_shared;
-        self.shared_gradient += weighted * row.residual;
-        self.mixed += row.by_step.transpose() * weight * by_shared;
-    }
-}
-
-/// Information of the matches of one mapped frame about δ in true = pose · exp(δ), ordered (v, ω),
-/// and about the errors that the frame's points share.
-#[derive(Debug, Clone, PartialEq)]
-struct FrameInformation {
-    pose: Matrix6<f64>,
-    mixed: SMatrix<f64, 6, SHARED>,
-    shared: SMatrix<f64, SHARED, SHARED>,
-}
-
 /// Information of a view's matches about its pose, for any noise of the map.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PoseInformation {
-    frames: Vec<FrameInformation>,
+    /// Information matrix (inverse covariance) of δ in true = pose · exp(δ), ordered (v, ω), if
+    /// the errors of all matches were independent.
+    pub independent: Matrix6<f64>,
     /// Distance of the view from the nearest matched frame, in units (median depths) plus radians.
     pub gap: f64,
 }
@@ -478,75 +370,10 @@ impl PoseInformation {
     /// pose is stated with the same noise as the poses of the map; `None` if the matches do not
     /// determine the pose.
     pub fn covariance(&self, noise: &MapNoise) -> Option<Matrix6<f64>> {
-        let prior = SMatrix::<f64, SHARED, SHARED>::from_diagonal(&noise.information());
-        let mut information = Matrix6::zeros();
-        for frame in &self.frames {
-            let share = noise.design_effect.recip();
-            let factors = Cholesky::new(frame.shared * share + prior)?;
-            let mixed = frame.mixed * share;
-            information += frame.pose * share - mixed * factors.solve(&mixed.transpose());
-        }
-
-        // The stated poses drift, and depths err together: both errors grow with the distance from
-        // the matched frames.
-        let variance = |still: f64, growth: f64| still.powi(2) + (growth * self.gap).powi(2);
-        let v = variance(noise.translation_m, noise.translation_growth_m);
-        let w = variance(noise.rotation_rad, noise.rotation_growth_rad);
-        let drift = Matrix6::from_diagonal(&Vector6::new(v, v, v, w, w, w));
-        let covariance = Cholesky::new(information)?.inverse() + drift;
+        let factor = noise.design_effect * (1.0 + self.gap / noise.gap_scale);
+        let [v, w] = [noise.translation_m, noise.rotation_rad].map(|deviation| deviation.powi(2));
+        let stated = Matrix6::from_diagonal(&Vector6::new(v, v, v, w, w, w));
+        let covariance = Cholesky::new(self.independent)?.inverse() * factor + stated;
         Some((covariance + covariance.transpose()) * 0.5)
-    }
-}
-
-/// Joint normal equations: the shared errors of different frames are independent given the pose.
-struct JointEquations {
-    frames: BTreeMap<usize, FrameEquations>,
-}
-
-impl JointEquations {
-    /// The equations of the pose, with all shared errors eliminated.
-    fn reduced(&self) -> NormalEquations {
-        let mut reduced = NormalEquations::default();
-        for frame in self.frames.values() {
-            let Some(factors) = Cholesky::new(frame.shared) else {
-                continue;
-            };
-            let solved = factors.solve(&frame.mixed.transpose());
-            reduced.information += frame.pose.information - frame.mixed * solved;
-            reduced.gradient += frame.pose.gradient - solved.transpose() * frame.shared_gradient;
-        }
-
-        reduced
-    }
-
-    fn step(&self) -> Option<Vector6<f64>> {
-        self.reduced().step()
-    }
-
-    /// The information of the matches alone, without the prior on the shared errors.
-    fn information(&self, noise: &MapNoise) -> PoseInformation {
-        let prior = SMatrix::<f64, SHARED, SHARED>::from_diagonal(&noise.information());
-        let frames = self.frames.values().map(|frame| FrameInformation {
-            pose: frame.pose.information,
-            mixed: frame.mixed,
-            shared: frame.shared - prior,
-        });
-        PoseInformation {
-            frames: frames.collect(),
-            gap: 0.0,
-        }
-    }
-
-    /// Adds to the shared errors their steps that belong to a step of the pose.
-    fn update_shared(&self, step: &Vector6<f64>, shared: &mut BTreeMap<usize, SharedErrors>) {
-        for (frame, errors) in shared {
-            let Some(equations) = self.frames.get(frame) else {
-                continue;
-            };
-            let gradient = equations.shared_gradient - equations.mixed.transpose() * step;
-            if let Some(factors) = Cholesky::new(equations.shared) {
-                *errors += factors.solve(&gradient);
-            }
-        }
     }
 }

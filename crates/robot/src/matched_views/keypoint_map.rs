@@ -81,7 +81,7 @@ pub struct KeypointMap {
     /// Median distance of matched keypoints from their epipolar lines, pixels; measures the noise of
     /// the map's poses and of its camera.
     pub epipolar_px: f64,
-    /// Errors that the points of a mapped frame share.
+    /// Noise, from which covariances follow.
     pub noise: MapNoise,
     /// Compression of the descriptors.
     pub basis: DescriptorBasis,

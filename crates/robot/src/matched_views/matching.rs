@@ -145,7 +145,6 @@ impl<'a> Query<'a> {
             focal_px: pixel_focal(&self.map.camera),
             threshold_px: self.map.threshold_px(),
             deviation_px: parameters.deviation_px,
-            noise: self.map.noise,
             iterations: parameters.iterations,
             miss_probability: parameters.miss_probability,
             seed: SEED,
@@ -169,8 +168,7 @@ impl<'a> Query<'a> {
             })
             .collect();
 
-        let mut information = found.information;
-        information.gap = frames
+        let gap = frames
             .iter()
             .map(|&frame| self.map.gap(&poses[frame], &found.pose))
             .fold(f64::INFINITY, f64::min);
@@ -180,7 +178,10 @@ impl<'a> Query<'a> {
             inliers: unique.len(),
             matched: all.len(),
             frames: frames.into_iter().collect(),
-            information,
+            information: PoseInformation {
+                independent: found.information,
+                gap,
+            },
             matches,
         })
     }

@@ -1,7 +1,7 @@
 //! Measures the noise of a map: trials map a part of its frames, estimate the poses of the others,
 //! and the noise under which the errors are most probable is found.
 
-use nalgebra::{Cholesky, Matrix6, SVector, Vector6};
+use nalgebra::{Cholesky, Matrix6, Vector4, Vector6};
 use ndarray::ArrayView2;
 
 use super::absolute_pose::{MapNoise, PoseInformation};
@@ -12,8 +12,6 @@ use super::retrieval::UnitFeatures;
 use seese3_core::geometry::{CameraIntrinsics, Pose, log};
 use seese3_core::keypoints::Keypoints;
 
-/// Number of fitted deviations.
-const PARAMETERS: usize = 6;
 /// Number of views of each trial.
 const VIEWS: usize = 80;
 /// Minimum number of trial views from which a noise is fitted.
@@ -169,22 +167,20 @@ pub fn fitted_noise(trials: &[Trial], unit_m: f64) -> Option<MapNoise> {
     }
 
     let typical = MapNoise::typical(unit_m);
-    let noise_at = |logarithms: SVector<f64, PARAMETERS>| MapNoise {
-        translation_m: typical.translation_m * logarithms[0].exp(),
-        rotation_rad: typical.rotation_rad * logarithms[1].exp(),
-        log_depth: typical.log_depth * logarithms[2].exp(),
-        translation_growth_m: typical.translation_growth_m * logarithms[3].exp(),
-        rotation_growth_rad: typical.rotation_growth_rad * logarithms[4].exp(),
-        design_effect: typical.design_effect * logarithms[5].exp(),
+    let noise_at = |logarithms: Vector4<f64>| MapNoise {
+        translation_m: typical.translation_m * logarithms.x.exp(),
+        rotation_rad: typical.rotation_rad * logarithms.y.exp(),
+        design_effect: typical.design_effect * logarithms.z.exp(),
+        gap_scale: typical.gap_scale * logarithms.w.exp(),
     };
     let [least, most] = RANGE.map(f64::ln);
 
     // Compass search: the likelihood is cheap and has few parameters.
-    let mut at = SVector::zeros();
+    let mut at = Vector4::zeros();
     let mut cost = negative_log_likelihood(trials, &noise_at(at));
     let mut step = FIRST_FACTOR.ln();
     while step > LAST_FACTOR.ln() {
-        let tried = (0..2 * PARAMETERS).map(|direction| {
+        let tried = (0..8).map(|direction| {
             let mut moved = at;
             let change = if direction % 2 == 0 { step } else { -step };
             moved[direction / 2] = (moved[direction / 2] + change).clamp(least, most);
