@@ -18,6 +18,46 @@ const FISHEYE: &str = "fisheye";
 #[derive(Debug, Clone, Copy)]
 pub struct CameraOption(pub CameraIntrinsics);
 
+impl CameraOption {
+    /// The option's text for images of this width in pixels, which [`FromStr`] reads. Lengths are
+    /// rounded to 0.1 pixels, coefficients to 0.0001.
+    pub fn text(&self, width: u32) -> String {
+        let Self(camera) = self;
+        let pixels = camera.in_pixels(f64::from(width));
+        let rounded = |value: f64, steps: f64| (value * steps).round() / steps;
+        let pixel = |value: f64| rounded(value, 10.0);
+
+        let middle = Vector2::new(pixels.width, pixels.height) / 2.0;
+        let center = pixels.center.unwrap_or(middle);
+        let [fx, fy] = [pixel(pixels.focal.x), pixel(pixels.focal.y)];
+        let mut text = format!("{width}x{},{fx}", pixels.height.round());
+        if fx != fy {
+            text += &format!(",{fy}");
+        }
+        if fx != fy || (center - middle).amax() >= 0.1 {
+            text += &format!(",{},{}", pixel(center.x), pixel(center.y));
+        }
+
+        let coefficient = |value: &f64| rounded(*value, 1e4);
+        match camera.distortion() {
+            Distortion::None => {}
+            Distortion::BrownConrady(values) => {
+                let values = values.each_ref().map(coefficient);
+                for (key, value) in BROWN_CONRADY.iter().zip(values) {
+                    if value != 0.0 {
+                        text += &format!(",{key}={value}");
+                    }
+                }
+            }
+            Distortion::KannalaBrandt(values) => {
+                let [k1, k2, k3, k4] = values.each_ref().map(coefficient);
+                text += &format!(",{FISHEYE}={k1}:{k2}:{k3}:{k4}");
+            }
+        }
+        text
+    }
+}
+
 impl FromStr for CameraOption {
     type Err = anyhow::Error;
 
@@ -157,6 +197,23 @@ mod tests {
             Distortion::KannalaBrandt([-0.03, 0.01, -0.002, 0.0005])
         );
         assert_eq!(lens("640x480,525,k1=0"), Distortion::None);
+    }
+
+    /// Oracle: the texts as a person would give them.
+    #[test]
+    fn a_camera_is_written_as_it_is_read() {
+        for text in [
+            "640x480,525",
+            "640x480,519.4,k1=-0.0616",
+            "640x480,525,330.5,250",
+            "640x480,525,530,320,240",
+            "752x480,458.7,457.3,367.2,248.4,k1=-0.2834,k2=0.074,p1=0.0002",
+            "640x480,525,fisheye=-0.03:0.01:-0.002:0.0005",
+        ] {
+            let camera: CameraOption = text.parse().unwrap();
+            let width = text.split('x').next().unwrap().parse().unwrap();
+            assert_eq!(camera.text(width), text);
+        }
     }
 
     /// Oracle: the form of the option.

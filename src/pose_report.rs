@@ -4,14 +4,15 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 
+use super::camera::CameraOption;
 use super::output::say;
 use super::pose_options::flags_of;
 use super::progress::bar;
 use seese3_core::geometry::Pose;
 use seese3_core::room::{FrameId, Room};
 use seese3_data::pose_check::{
-    Convention, ImageReport, LengthUnit, PathFacts, PathWarning, PoseCheck, PoseReport,
-    PoseWarning, RoomImages, Verdict, check_room,
+    CameraFitError, Convention, FittedCamera, ImageReport, LengthUnit, PathFacts, PathWarning,
+    PoseCheck, PoseReport, PoseWarning, RoomImages, Verdict, check_room,
 };
 use seese3_encoder::{image_size, read_image};
 
@@ -86,6 +87,7 @@ fn with_advice(warning: &PoseWarning, from: PosesFrom) -> String {
             LengthUnit::Unknown => "--scale FACTOR".to_owned(),
         }),
         PoseWarning::Focal { .. } => Some("--camera".to_owned()),
+        PoseWarning::Camera { fitted, .. } => Some(camera_flag(fitted)),
         PoseWarning::Verdict { check, .. } => verdict_advice(&check.verdict, from),
         _ => None,
     };
@@ -94,6 +96,12 @@ fn with_advice(warning: &PoseWarning, from: PosesFrom) -> String {
         Some(advice) => format!("{warning} ({advice})"),
         None => warning.to_string(),
     }
+}
+
+/// The option of `import` that states the fitted camera.
+fn camera_flag(fitted: &FittedCamera) -> String {
+    let (width, _) = fitted.image_size;
+    format!("--camera {}", CameraOption(fitted.camera).text(width))
 }
 
 fn verdict_advice(verdict: &Verdict, from: PosesFrom) -> Option<String> {
@@ -186,6 +194,37 @@ fn say_images(images: &ImageReport) {
             "poses against images: contradict each other, the poses explain {share} ({pair_count} pairs)"
         )),
     }
+    if let Some(fit) = &images.camera_fit {
+        say(format_args!("focal length: {}", camera_text(fit)));
+    }
+}
+
+fn camera_text(fit: &Result<FittedCamera, CameraFitError>) -> String {
+    let fitted = match fit {
+        Ok(fitted) => fitted,
+        Err(error) => return format!("not estimated: {error}"),
+    };
+    let FittedCamera {
+        matches, median_px, ..
+    } = fitted;
+    if !fitted.is_determined() {
+        return format!(
+            "not determined by the camera's motion, standard deviation {:.0} % ({matches} matches)",
+            100.0 * fitted.focal_deviation
+        );
+    }
+
+    let with_stated = match fitted.stated_median_px {
+        Some(stated_px) => format!("{stated_px:.2} with the stated camera"),
+        None => format!("no camera is stated: {}", camera_flag(fitted)),
+    };
+    format!(
+        "{:.1} +- {:.1} pixels, k1 {:.3}; median epipolar error {median_px:.2} pixels of images \
+         320 wide ({matches} matches; {with_stated})",
+        fitted.focal_px(),
+        fitted.focal_px() * fitted.focal_deviation,
+        fitted.k1(),
+    )
 }
 
 fn path_json(path: &PathFacts) -> Value {
@@ -237,5 +276,17 @@ fn images_json(images: &ImageReport) -> Value {
         "focal_widths": seen.map(|seen| seen.focal),
         "depth_m": seen.and_then(|seen| seen.depth),
         "sizes": sizes.collect::<Vec<_>>(),
+        "camera_fit": images.camera_fit.as_ref().and_then(|fit| fit.as_ref().ok()).map(camera_json),
+    })
+}
+
+fn camera_json(fitted: &FittedCamera) -> Value {
+    json!({
+        "focal_px": fitted.focal_px(),
+        "k1": fitted.k1(),
+        "median_px": fitted.median_px,
+        "stated_median_px": fitted.stated_median_px,
+        "matches": fitted.matches,
+        "focal_deviation": fitted.focal_deviation,
     })
 }

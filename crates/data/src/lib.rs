@@ -37,11 +37,13 @@
 //! | module | what |
 //! | --- | --- |
 //! | [`image_motion`] | estimates how an image moved between two views |
+//! | `point_matches` | matches points between two images with known poses |
 //! | [`pose_check`] | checks whether poses match a recording's images |
 //! | [`datasets`] | reads recordings from disk |
 //! | [`export`] | writes trajectories and streams for other programs: TUM, KITTI, MCAP |
 
 pub mod export;
 pub mod image_motion;
+mod point_matches;
 pub mod pose_check;
 pub mod datasets;

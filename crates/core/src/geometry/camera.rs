@@ -365,6 +365,14 @@ impl CameraIntrinsics {
         })
     }
 
+    /// Derivative of [`Self::to_image_plane`] by the image point, at a point of the plane; zero where
+    /// the distortion has no inverse.
+    pub(crate) fn plane_derivative(&self, plane: Vector2<f64>) -> Matrix2<f64> {
+        let (_, derivative) = self.distortion.distort(plane);
+        let by_plane = Matrix2::from_diagonal(&self.focal) * derivative;
+        by_plane.try_inverse().unwrap_or_else(Matrix2::zeros)
+    }
+
     /// The undistorted point of a distorted one, both on the plane at depth 1; `None` if Newton's
     /// method does not converge.
     fn undistort(&self, distorted: Vector2<f64>) -> Option<Vector2<f64>> {

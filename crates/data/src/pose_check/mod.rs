@@ -23,11 +23,13 @@
 //! | `motion_fit` | share of the image motion that poses explain |
 //! | `evidence` | whether a small difference is consistent throughout a recording |
 //! | `path` | statistics of the poses alone: extents, steps, jumps |
+//! | `camera_fit` | focal length and radial distortion from epipolar errors |
 //! | `report` | [`check_room`]: all checks of a room, and the warnings in words |
 //!
 //! Not a method of the paper. The limits were chosen on a real recording and on drawn rooms;
 //! docs/rooms-and-encoders.md reports the results on held-out rooms that were drawn afterwards.
 
+mod camera_fit;
 mod convention;
 mod evidence;
 mod motion_fit;
@@ -35,6 +37,7 @@ mod path;
 mod report;
 mod translations;
 
+pub use camera_fit::{CameraFitError, FittedCamera};
 pub use convention::{Axes, Convention, Direction, QuaternionOrder};
 pub use motion_fit::SceneEstimate;
 pub use path::{PathFacts, PathWarning, is_identity};

@@ -3,9 +3,10 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
+use super::camera_fit::CameraEvidence;
 use super::{
-    Convention, ObservedPair, PathFacts, PathWarning, PoseCheck, SceneEstimate, Translations,
-    Verdict, check, is_identity, pairs_to_look_at,
+    CameraFitError, Convention, FittedCamera, ObservedPair, PathFacts, PathWarning, PoseCheck,
+    SceneEstimate, Translations, Verdict, check, is_identity, pairs_to_look_at,
 };
 use crate::image_motion::{SmallImage, align};
 use seese3_core::geometry::{CameraIntrinsics, Pose};
@@ -57,6 +58,8 @@ pub struct ImageReport {
     pub unreadable_count: usize,
     /// The comparison with the poses.
     pub check: PoseCheck,
+    /// The camera fitted to the images; `None` if the poses do not agree with the images.
+    pub camera_fit: Option<Result<FittedCamera, CameraFitError>>,
     /// Whether no pair was left to compare, because all poses are equal or those of lost tracking.
     pub is_all_lost: bool,
 }
@@ -109,6 +112,13 @@ pub enum PoseWarning {
         fitted: f64,
         /// The room's camera, image widths.
         stated: f64,
+    },
+    /// The camera fitted to the images contradicts the stated one.
+    Camera {
+        /// The fitted camera.
+        fitted: FittedCamera,
+        /// The room's camera.
+        stated: CameraIntrinsics,
     },
     /// An image has another aspect ratio than the stated camera.
     Aspect {
@@ -177,19 +187,45 @@ impl PoseReport {
                 read_as: images.read_as,
             });
         }
+        let mut camera_fit = None;
         if let Verdict::Agrees(seen) = check.verdict {
             self.warnings.extend(depth_warning(seen));
-            let camera = room.provenance().camera;
+            let fit = self.fit_camera(room, images, &sizes, seen);
+            let stated = room.provenance().camera;
             self.warnings
-                .extend(camera.and_then(|camera| focal_warning(seen, camera)));
+                .extend(stated.and_then(|stated| camera_warning(fit.as_ref().ok(), seen, stated)));
+            camera_fit = Some(fit);
         }
         self.warnings.extend(aspect_warning(room, &sizes));
         self.images = Some(ImageReport {
             unreadable_count: room.images().len() - sizes.values().sum::<usize>(),
             sizes,
             check,
+            camera_fit,
             is_all_lost: observed_count > 0 && observed.is_empty(),
         });
+    }
+
+    fn fit_camera(
+        &self,
+        room: &Room,
+        images: &RoomImages<'_>,
+        sizes: &BTreeMap<(u32, u32), usize>,
+        seen: SceneEstimate,
+    ) -> Result<FittedCamera, CameraFitError> {
+        let is_usable = |row: &usize| !self.is_lost(&room.poses()[*row]);
+        let rows: Vec<usize> = (0..room.frame_count()).filter(is_usable).collect();
+        let poses: Vec<Pose> = rows.iter().map(|&row| room.poses()[row]).collect();
+
+        let most_frequent = sizes.iter().max_by_key(|(_, count)| **count);
+        CameraEvidence {
+            poses: &poses,
+            read: &|place| (images.read)(&room.images()[rows[place]]),
+            image_size: most_frequent.map_or((0, 0), |(size, _)| *size),
+            seen,
+            stated: room.provenance().camera,
+        }
+        .fit()
     }
 
     /// Whether recorders write this pose when tracking is lost.
@@ -274,6 +310,20 @@ fn depth_warning(seen: SceneEstimate) -> Option<PoseWarning> {
         LengthUnit::Unknown
     };
     Some(PoseWarning::Depth { depth_m, unit })
+}
+
+/// The warning about the stated camera, by the fitted camera if the motion determines it.
+fn camera_warning(
+    fitted: Option<&FittedCamera>,
+    seen: SceneEstimate,
+    stated: CameraIntrinsics,
+) -> Option<PoseWarning> {
+    match fitted.filter(|fitted| fitted.is_determined()) {
+        Some(&fitted) => fitted
+            .contradicts(&stated)
+            .then_some(PoseWarning::Camera { fitted, stated }),
+        None => focal_warning(seen, stated),
+    }
 }
 
 fn focal_warning(seen: SceneEstimate, camera: CameraIntrinsics) -> Option<PoseWarning> {
@@ -379,6 +429,17 @@ impl fmt::Display for PoseWarning {
                 f,
                 "the images move as through a focal length of {fitted:.2} image widths, and the \
                  room's camera has {stated:.2}: is the stated camera right?"
+            ),
+            Self::Camera { fitted, stated } => write!(
+                f,
+                "the images contradict the stated camera: its focal length is {:.0} pixels, and \
+                 {:.1} +- {:.1} is estimated, which reduces the median epipolar error from {:.1} to \
+                 {:.1} pixels of an image 320 wide",
+                stated.focal().mean() * f64::from(fitted.image_size.0),
+                fitted.focal_px(),
+                fitted.focal_px() * fitted.focal_deviation,
+                fitted.stated_median_px.unwrap_or(f64::NAN),
+                fitted.median_px,
             ),
             Self::Aspect {
                 stated,

@@ -7,6 +7,7 @@
     reason = "a failed step is a failed run here, and a case may be long"
 )]
 
+mod camera_fit;
 mod formulations;
 mod kitchen;
 mod planning;
