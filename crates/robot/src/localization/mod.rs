@@ -17,11 +17,6 @@ use crate::tracking::PoseWithCovariance;
 use seese3_core::geometry::{CameraIntrinsics, Pose};
 use seese3_core::keypoints::Keypoints;
 
-/// Largest standard deviation of an accepted position, units (median depths of the map).
-const MAX_POSITION_DEVIATION: f64 = 0.1;
-/// Largest standard deviation of an accepted rotation, radians: 5°.
-const MAX_ROTATION_DEVIATION: f64 = 0.087;
-
 /// A mapped room in which views are located by their keypoints.
 #[derive(Debug, Clone)]
 pub struct KeypointRoom {
@@ -65,8 +60,8 @@ pub enum NotLocated {
     )]
     NotInMap { inliers: usize, keypoints: usize },
     #[error(
-        "{inliers} keypoints agree with the map, but they leave the pose uncertain by {position_m:.2} m and \
-         {rotation_deg:.1} degrees"
+        "{inliers} keypoints agree with the map, but in a small part of the image or too far from it: the pose is \
+         uncertain by {position_m:.2} m and {rotation_deg:.1} degrees"
     )]
     Uncertain {
         inliers: usize,
@@ -171,9 +166,16 @@ impl KeypointRoom {
         };
         let position_m = pose.position_deviation_m();
         let rotation_rad = pose.rotation_deviation_rad();
-        if position_m > MAX_POSITION_DEVIATION * self.map.unit_m
-            || rotation_rad > MAX_ROTATION_DEVIATION
-        {
+        let MatchingParameters {
+            min_spread,
+            max_position_deviation,
+            max_rotation_deviation_rad,
+            ..
+        } = self.parameters;
+        let is_certain = matched.spread >= min_spread
+            && position_m <= max_position_deviation * self.map.unit_m
+            && rotation_rad <= max_rotation_deviation_rad;
+        if !is_certain {
             return Err(NotLocated::Uncertain {
                 inliers,
                 position_m,

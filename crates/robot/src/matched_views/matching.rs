@@ -12,6 +12,7 @@ use super::parameters::MatchingParameters;
 use super::triangulation::{pixel_focal, plane_points};
 use seese3_core::geometry::{CameraIntrinsics, Pose};
 use seese3_core::keypoints::Keypoints;
+use seese3_core::statistics::{mean, root_mean_square};
 
 /// Seed of RANSAC; equal views get equal answers.
 const SEED: u64 = 1;
@@ -43,6 +44,9 @@ pub struct MatchedView {
     pub matched: usize,
     /// The mapped frames with inliers, in the map's rows.
     pub frames: Vec<usize>,
+    /// Spread of the inliers over the image: the product of the standard deviations of their
+    /// positions along both axes, fractions of the image's width and height.
+    pub spread: f64,
     /// Information of the matches about the pose.
     pub information: PoseInformation,
     /// The inliers.
@@ -93,17 +97,20 @@ impl KeypointMap {
 /// A view, prepared for matching.
 struct Query<'a> {
     map: &'a KeypointMap,
+    /// Positions of the keypoints in the image.
+    points: &'a [Vector2<f32>],
     plane: Vec<Vector2<f64>>,
     descriptors: Array2<f32>,
 }
 
 impl<'a> Query<'a> {
-    fn new(map: &'a KeypointMap, view: ViewKeypoints<'_>, parameters: &MatchingParameters) -> Self {
+    fn new(map: &'a KeypointMap, view: ViewKeypoints<'a>, parameters: &MatchingParameters) -> Self {
         let plane = plane_points(view.keypoints, view.camera, parameters.candidates);
         let mut compressed = map.basis.compress(view.keypoints);
         compressed.truncate(plane.len() * super::COMPRESSED);
         Self {
             map,
+            points: view.keypoints.points(),
             plane,
             descriptors: unpacked(&compressed),
         }
@@ -178,6 +185,7 @@ impl<'a> Query<'a> {
             inliers: unique.len(),
             matched: all.len(),
             frames: frames.into_iter().collect(),
+            spread: spread(self.points, &unique),
             information: PoseInformation {
                 independent: found.information,
                 gap,
@@ -185,4 +193,17 @@ impl<'a> Query<'a> {
             matches,
         })
     }
+}
+
+/// Product of the standard deviations along both axes of some of the points.
+fn spread(points: &[Vector2<f32>], places: &BTreeSet<usize>) -> f64 {
+    let deviation = |axis: usize| {
+        let values: Vec<f64> = places
+            .iter()
+            .map(|&place| f64::from(points[place][axis]))
+            .collect();
+        let center = mean(&values);
+        root_mean_square(&values.iter().map(|x| x - center).collect::<Vec<f64>>())
+    };
+    deviation(0) * deviation(1)
 }

@@ -71,6 +71,13 @@ pub struct MatchingParameters {
     pub confident_inliers: usize,
     /// Minimum number of unique inliers of an accepted pose.
     pub min_inliers: usize,
+    /// Minimum spread of the inliers of an accepted pose: the product of the standard deviations of
+    /// their positions along both axes, fractions of the image's width and height.
+    pub min_spread: f64,
+    /// Largest standard deviation of an accepted position, units (median depths of the map).
+    pub max_position_deviation: f64,
+    /// Largest standard deviation of an accepted rotation, radians.
+    pub max_rotation_deviation_rad: f64,
 }
 
 impl Default for MatchingParameters {
@@ -80,11 +87,14 @@ impl Default for MatchingParameters {
             more_frames: 10,
             candidates: 600,
             min_cosine: 0.5,
-            iterations: [100, 2_000],
+            iterations: [100, 1_000],
             miss_probability: 1e-4,
             deviation_px: 0.7,
             confident_inliers: 150,
-            min_inliers: 100,
+            min_inliers: 90,
+            min_spread: 0.016,
+            max_position_deviation: 0.05,
+            max_rotation_deviation_rad: 3_f64.to_radians(),
         }
     }
 }
