@@ -145,7 +145,7 @@ impl Encode {
 
         let keypoints = match mapping {
             Some((outputs, camera)) => {
-                let map = self.map(&newest.room, &encoded, sources[0].dim, camera)?;
+                let map = self.map(&newest.room, &encoded, camera)?;
                 Some(room_keypoints(
                     map,
                     sources[0].clone(),
@@ -201,13 +201,11 @@ impl Encode {
         }))
     }
 
-    /// Triangulates the keypoints of the encoded frames. `width` is that of the features by which
-    /// similar frames are retrieved.
+    /// Triangulates the keypoints of the encoded frames.
     fn map(
         &self,
         room: &Room,
         encoded: &Encoded,
-        width: usize,
         camera: CameraIntrinsics,
     ) -> anyhow::Result<KeypointMap> {
         let poses = room.frames().select(&encoded.good).poses;
@@ -218,7 +216,6 @@ impl Encode {
             map_keypoints(TrialRecording {
                 poses: &poses,
                 keypoints: &encoded.keypoints,
-                features: encoded.rows.slice(ndarray::s![.., ..width]),
                 camera,
             })
         })

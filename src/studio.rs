@@ -355,7 +355,6 @@ impl Studio {
         let map = map_keypoints(TrialRecording {
             poses: room.poses(),
             keypoints: &encoded.keypoints,
-            features: encoded.rows.slice(ndarray::s![.., ..feature.dim]),
             camera,
         })?;
         room_keypoints(map, feature.clone(), outputs, &self.encode).map(Some)

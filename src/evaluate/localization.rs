@@ -143,7 +143,6 @@ impl Localization {
         let recording = TrialRecording {
             poses: stored.room.poses(),
             keypoints: &encoded.keypoints,
-            features: encoded.rows.view(),
             camera: keypoints.map.camera,
         };
 
@@ -155,7 +154,9 @@ impl Localization {
         };
         let found = self.runtime.pool()?.install(|| {
             let clock = || begun.elapsed().as_secs_f64();
-            matched_localization::evaluate(recording, frames, &clock, &|| progress.inc(1))
+            matched_localization::evaluate(recording, encoded.rows.view(), frames, &clock, &|| {
+                progress.inc(1)
+            })
         })?;
         progress.finish_and_clear();
 

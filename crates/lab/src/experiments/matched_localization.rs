@@ -2,7 +2,7 @@
 //! views of the others. Beside it, in the same run, the baselines of retrieval.
 
 use nalgebra::{Quaternion, UnitQuaternion, Vector3, Vector4};
-use ndarray::Axis;
+use ndarray::{Array2, ArrayView2};
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -10,8 +10,8 @@ use seese3_core::geometry::{Pose, PoseError, log};
 use seese3_core::keypoints::Keypoints;
 use seese3_core::room::FrameId;
 use seese3_core::statistics::{Coverage, coverage, root_mean_square};
-use seese3_robot::localization::{KeypointQuery, KeypointRoom, NotLocated};
-use seese3_robot::matched_views::{Mapping, MappingParameters, TrialRecording};
+use seese3_robot::localization::{KeypointRoom, NotLocated};
+use seese3_robot::matched_views::{Mapping, MappingParameters, TrialRecording, ViewKeypoints};
 
 use super::Error;
 use super::localization::LocalizationErrors;
@@ -100,12 +100,13 @@ struct Located {
 }
 
 /// Maps the mapped frames of a recording and locates the asked ones, on the threads of the calling
-/// rayon pool. `clock` gives seconds; `done` is called after each view.
+/// rayon pool. The baselines retrieve frames by `features`, shape (n, d). `clock` gives seconds; `done` is called after each view.
 ///
 /// # Errors
 /// [`Error::Input`] if no frame is mapped or asked for, or if no mapped frame has a keypoint.
 pub fn evaluate(
     recording: TrialRecording<'_>,
+    features: ArrayView2<'_, f32>,
     frames: MappedAndAsked<'_>,
     clock: &(dyn Fn() -> f64 + Sync),
     done: &(dyn Fn() + Sync),
@@ -120,15 +121,11 @@ pub fn evaluate(
     }
 
     let room = mapped_room(recording, mapped)?;
-    let poses: Vec<Pose> = mapped
-        .iter()
-        .map(|frame| recording.poses[frame.row()])
-        .collect();
-
+    let baselines = Baselines::new(recording.poses, features, mapped);
     let views: Vec<View> = asked
         .par_iter()
         .map(|frame| {
-            let view = located(recording, &room, &poses, frame.row(), clock);
+            let view = located(recording, &room, &baselines, frame.row(), clock);
             done();
             view
         })
@@ -157,12 +154,10 @@ fn mapped_room(recording: TrialRecording<'_>, mapped: &[FrameId]) -> Result<Keyp
         .iter()
         .map(|&row| recording.keypoints[row].clone())
         .collect();
-    let features = recording.features.select(Axis(0), &rows);
     let known = TrialRecording {
         poses: &poses,
         keypoints: &keypoints,
-        features: features.view(),
-        ..recording
+        camera: recording.camera,
     };
 
     let mapping = Mapping::new(
@@ -174,33 +169,25 @@ fn mapped_room(recording: TrialRecording<'_>, mapped: &[FrameId]) -> Result<Keyp
     let mapping = mapping.map_err(|error| Error::Input(error.to_string()))?;
     let mut map = mapping.map(&|| ());
     map.measure_noise(known);
-    Ok(KeypointRoom::new(
-        poses.clone(),
-        features.view(),
-        map.into(),
-    ))
+    Ok(KeypointRoom::new(poses.clone(), map.into()))
 }
 
 fn located(
     recording: TrialRecording<'_>,
     room: &KeypointRoom,
-    mapped: &[Pose],
+    baselines: &Baselines<'_>,
     row: usize,
     clock: &(dyn Fn() -> f64 + Sync),
 ) -> View {
     let truth = recording.poses[row];
-    let feature = recording.features.row(row);
-    let similar = room.most_similar(feature, BLENDED);
-
     let begun = clock();
-    let located = room.locate(KeypointQuery {
-        feature,
+    let located = room.locate(ViewKeypoints {
         keypoints: &recording.keypoints[row],
         camera: &recording.camera,
     });
     let seconds = clock() - begun;
 
-    let is_near = mapped.iter().any(|pose| {
+    let is_near = baselines.poses.iter().any(|pose| {
         let error = PoseError::between(&truth, pose);
         error.translation_m <= NEAR_M && error.rotation_rad <= NEAR_RAD
     });
@@ -217,45 +204,76 @@ fn located(
         }
     });
 
+    let (nearest, blend) = baselines.poses_of(row);
     View {
         truth,
         located,
-        nearest: mapped[similar[0]],
-        blend: blended(room, mapped, &similar, feature),
+        nearest,
+        blend,
         is_near,
         seconds,
     }
 }
 
-/// Mean of the poses of similar frames, weighted by the inverse fourth power of the distance
-/// between unit features.
-fn blended(
-    room: &KeypointRoom,
-    mapped: &[Pose],
-    similar: &[usize],
-    feature: ndarray::ArrayView1<'_, f32>,
-) -> Pose {
-    let weights: Vec<f64> = similar
-        .iter()
-        .map(|&row| {
-            let squared = 2.0 - 2.0 * f64::from(room.similarity(row, feature));
-            squared.max(1e-8).powi(-2)
-        })
-        .collect();
-    let sum: f64 = weights.iter().sum();
+/// Poses of the mapped frames with the most similar features.
+struct Baselines<'a> {
+    /// `world_from_camera` of the mapped frames.
+    poses: Vec<Pose>,
+    /// Features of all frames, scaled to unit length.
+    features: Array2<f32>,
+    mapped: &'a [FrameId],
+}
 
-    let mut position = Vector3::zeros();
-    let mut rotation = Vector4::zeros();
-    let first = mapped[similar[0]].rotation.into_inner().coords;
-    for (&row, weight) in similar.iter().zip(&weights) {
-        position += mapped[row].translation.vector * (weight / sum);
-        // Quaternions of one hemisphere, so that they add up.
-        let coordinates = mapped[row].rotation.into_inner().coords;
-        rotation += coordinates * (weight * coordinates.dot(&first).signum());
+impl<'a> Baselines<'a> {
+    fn new(poses: &[Pose], features: ArrayView2<'_, f32>, mapped: &'a [FrameId]) -> Self {
+        let mut features = features.to_owned();
+        for mut row in features.rows_mut() {
+            let length = row.dot(&row).sqrt().max(1e-12);
+            row /= length;
+        }
+
+        Self {
+            poses: mapped.iter().map(|frame| poses[frame.row()]).collect(),
+            features,
+            mapped,
+        }
     }
 
-    let rotation = UnitQuaternion::from_quaternion(Quaternion::from(rotation));
-    Pose::from_parts(position.into(), rotation)
+    /// The pose of the most similar mapped frame, and the mean of the three most similar ones,
+    /// weighted by the inverse fourth power of the distance between unit features.
+    fn poses_of(&self, row: usize) -> (Pose, Pose) {
+        let view = self.features.row(row);
+        let mut similar: Vec<(f64, &Pose)> = self
+            .mapped
+            .iter()
+            .zip(&self.poses)
+            .map(|(frame, pose)| (f64::from(self.features.row(frame.row()).dot(&view)), pose))
+            .collect();
+        similar.sort_by(|a, b| b.0.total_cmp(&a.0));
+        similar.truncate(BLENDED);
+
+        let weights: Vec<f64> = similar
+            .iter()
+            .map(|(cosine, _)| (2.0 - 2.0 * cosine).max(1e-8).powi(-2))
+            .collect();
+        let sum: f64 = weights.iter().sum();
+
+        let nearest = *similar[0].1;
+        let mut position = Vector3::zeros();
+        let mut rotation = Vector4::zeros();
+        for ((_, pose), weight) in similar.iter().zip(&weights) {
+            position += pose.translation.vector * (weight / sum);
+            // Quaternions of one hemisphere, so that they add up.
+            let coordinates = pose.rotation.into_inner().coords;
+            let sign = coordinates
+                .dot(&nearest.rotation.into_inner().coords)
+                .signum();
+            rotation += coordinates * (weight * sign);
+        }
+
+        let rotation = UnitQuaternion::from_quaternion(Quaternion::from(rotation));
+        (nearest, Pose::from_parts(position.into(), rotation))
+    }
 }
 
 fn part_of(views: &[&View]) -> MatchedPart {

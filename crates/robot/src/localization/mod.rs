@@ -1,6 +1,6 @@
 //! Estimates where a view is in a mapped room, by matching its keypoints with those of the map.
 //!
-//! 1. The mapped frames most similar to the view are retrieved by their features or, near a
+//! 1. The mapped frames most similar to the view are retrieved by their keypoints or, near a
 //!    predicted pose, by their poses.
 //! 2. The view's keypoints are matched with theirs, and the pose is estimated
 //!    ([`KeypointMap::match_view`]).
@@ -8,34 +8,20 @@
 
 use std::sync::Arc;
 
-use ndarray::{ArrayView1, ArrayView2};
-
 use crate::matched_views::{
-    KeypointMap, MatchedView, MatchingParameters, PlaceCandidates, UnitFeatures, ViewKeypoints,
+    Candidates, KeypointMap, MatchedView, MatchingParameters, PlaceIndex, ViewKeypoints,
 };
 use crate::tracking::PoseWithCovariance;
-use seese3_core::geometry::{CameraIntrinsics, Pose};
-use seese3_core::keypoints::Keypoints;
+use seese3_core::geometry::Pose;
 
 /// A mapped room in which views are located by their keypoints.
 #[derive(Debug, Clone)]
 pub struct KeypointRoom {
     /// `world_from_camera` of the mapped frames.
     poses: Vec<Pose>,
-    features: UnitFeatures,
+    places: PlaceIndex,
     map: Arc<KeypointMap>,
     parameters: MatchingParameters,
-}
-
-/// A view to locate.
-#[derive(Debug, Clone, Copy)]
-pub struct KeypointQuery<'a> {
-    /// Feature of the same encoder pass, shape (d).
-    pub feature: ArrayView1<'a, f32>,
-    /// Keypoints.
-    pub keypoints: &'a Keypoints,
-    /// Camera.
-    pub camera: &'a CameraIntrinsics,
 }
 
 /// The pose of a view that agrees with the map.
@@ -71,16 +57,15 @@ pub enum NotLocated {
 }
 
 impl KeypointRoom {
-    /// A room with these mapped frames: poses `world_from_camera`, and features of shape (n, d).
+    /// A room with these mapped frames: poses `world_from_camera`, and their keypoints.
     ///
     /// # Panics
-    /// If poses, features and map are not of the same number of frames.
-    pub fn new(poses: Vec<Pose>, features: ArrayView2<'_, f32>, map: Arc<KeypointMap>) -> Self {
-        assert_eq!(poses.len(), features.nrows());
+    /// If poses and map are not of the same number of frames.
+    pub fn new(poses: Vec<Pose>, map: Arc<KeypointMap>) -> Self {
         assert_eq!(poses.len(), map.frames.len());
         Self {
             poses,
-            features: UnitFeatures::of(features),
+            places: PlaceIndex::of(&map),
             map,
             parameters: MatchingParameters::default(),
         }
@@ -91,23 +76,12 @@ impl KeypointRoom {
         &self.map
     }
 
-    /// Rows of the `count` mapped frames most similar to a feature, the most similar first.
-    pub fn most_similar(&self, feature: ArrayView1<'_, f32>, count: usize) -> Vec<usize> {
-        self.features.nearest(feature, count)
-    }
-
-    /// Cosine similarity of the mapped frame in `row` and a feature of shape (d).
-    pub fn similarity(&self, row: usize, feature: ArrayView1<'_, f32>) -> f32 {
-        self.features.similarity(row, feature)
-    }
-
     /// Estimates the pose of a view.
     ///
     /// # Errors
     /// [`NotLocated`] if the view does not agree with the map.
-    pub fn locate(&self, query: KeypointQuery<'_>) -> Result<LocatedView, NotLocated> {
-        let candidates = self.most_similar(query.feature, self.parameters.more_frames);
-        self.locate_among(query, &candidates)
+    pub fn locate(&self, view: ViewKeypoints<'_>) -> Result<LocatedView, NotLocated> {
+        self.locate_among(view, Candidates::Similar(&self.places))
     }
 
     /// Estimates the pose of a view near a predicted pose, `world_from_camera`.
@@ -116,39 +90,25 @@ impl KeypointRoom {
     /// [`NotLocated`] if the view does not agree with the map.
     pub fn locate_near(
         &self,
-        query: KeypointQuery<'_>,
+        view: ViewKeypoints<'_>,
         predicted: &Pose,
     ) -> Result<LocatedView, NotLocated> {
-        let mut order: Vec<(f64, usize)> = self
-            .poses
-            .iter()
-            .enumerate()
-            .map(|(row, pose)| (self.map.gap(pose, predicted), row))
-            .collect();
-        order.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let nearest = order.iter().take(self.parameters.more_frames);
-        let candidates: Vec<usize> = nearest.map(|&(_, row)| row).collect();
-        self.locate_among(query, &candidates)
+        self.locate_among(view, Candidates::Near(predicted))
     }
 
     fn locate_among(
         &self,
-        query: KeypointQuery<'_>,
-        candidates: &[usize],
+        view: ViewKeypoints<'_>,
+        candidates: Candidates<'_>,
     ) -> Result<LocatedView, NotLocated> {
-        let KeypointQuery {
-            keypoints, camera, ..
-        } = query;
+        let keypoints = view.keypoints;
         if keypoints.is_empty() {
             return Err(NotLocated::NoKeypoints);
         }
 
-        let matched = self.map.match_view(
-            ViewKeypoints { keypoints, camera },
-            PlaceCandidates { frames: candidates },
-            &self.poses,
-            &self.parameters,
-        );
+        let matched = self
+            .map
+            .match_view(view, candidates, &self.poses, &self.parameters);
         let not_in_map = |inliers: usize| NotLocated::NotInMap {
             inliers,
             keypoints: keypoints.len(),

@@ -9,6 +9,7 @@ use super::absolute_pose::{Correspondence, PoseInformation, Search, find_pose};
 use super::descriptors::{mutual_matches, unpacked};
 use super::keypoint_map::KeypointMap;
 use super::parameters::MatchingParameters;
+use super::retrieval::PlaceIndex;
 use super::triangulation::{pixel_focal, plane_points};
 use seese3_core::geometry::{CameraIntrinsics, Pose};
 use seese3_core::keypoints::Keypoints;
@@ -26,11 +27,13 @@ pub struct ViewKeypoints<'a> {
     pub camera: &'a CameraIntrinsics,
 }
 
-/// Mapped frames that a view may resemble, the most promising first.
+/// Where a view may be in the map.
 #[derive(Debug, Clone, Copy)]
-pub struct PlaceCandidates<'a> {
-    /// Rows of the frames in the map.
-    pub frames: &'a [usize],
+pub enum Candidates<'a> {
+    /// The frames with the most similar keypoints.
+    Similar(&'a PlaceIndex),
+    /// The frames nearest to a predicted pose, `world_from_camera`.
+    Near(&'a Pose),
 }
 
 /// A view whose keypoints agree with the map under one pose.
@@ -71,26 +74,43 @@ impl KeypointMap {
     pub fn match_view(
         &self,
         view: ViewKeypoints<'_>,
-        candidates: PlaceCandidates<'_>,
+        candidates: Candidates<'_>,
         poses: &[Pose],
         parameters: &MatchingParameters,
     ) -> Option<MatchedView> {
         let query = Query::new(self, view, parameters);
-        let first = parameters.first_frames.min(candidates.frames.len());
-        let found = query.matched(&candidates.frames[..first], poses, parameters);
+        let frames = match candidates {
+            Candidates::Similar(index) => {
+                index.nearest(query.descriptors.view(), parameters.more_frames)
+            }
+            Candidates::Near(pose) => self.nearest_to(pose, poses, parameters.more_frames),
+        };
+
+        let first = parameters.first_frames.min(frames.len());
+        let found = query.matched(&frames[..first], poses, parameters);
         let is_enough = |found: &MatchedView| found.inliers >= parameters.confident_inliers;
-        if found.as_ref().is_some_and(is_enough) || candidates.frames.len() == first {
+        if found.as_ref().is_some_and(is_enough) || frames.len() == first {
             return found;
         }
 
-        let more = parameters.more_frames.min(candidates.frames.len());
-        let wider = query.matched(&candidates.frames[..more], poses, parameters);
+        let wider = query.matched(&frames, poses, parameters);
         let count = |found: &Option<MatchedView>| found.as_ref().map_or(0, |found| found.inliers);
         if count(&wider) > count(&found) {
             wider
         } else {
             found
         }
+    }
+
+    /// Rows of the `count` frames nearest to a pose, the nearest first.
+    fn nearest_to(&self, pose: &Pose, poses: &[Pose], count: usize) -> Vec<usize> {
+        let mut order: Vec<(f64, usize)> = poses
+            .iter()
+            .enumerate()
+            .map(|(row, mapped)| (self.gap(mapped, pose), row))
+            .collect();
+        order.sort_by(|a, b| a.0.total_cmp(&b.0));
+        order.into_iter().take(count).map(|(_, row)| row).collect()
     }
 }
 

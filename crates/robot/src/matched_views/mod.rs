@@ -9,8 +9,8 @@
 mod absolute_pose;
 mod descriptors;
 mod keypoint_map;
-mod matching;
 mod retrieval;
+mod matching;
 mod noise;
 mod p3p;
 mod parameters;
@@ -19,10 +19,10 @@ mod triangulation;
 pub use absolute_pose::{MapNoise, PoseInformation};
 pub use descriptors::{COMPRESSED, DescriptorBasis};
 pub use keypoint_map::{KeypointMap, MappedKeypoints, Mapping, epipolar_pairs};
-pub use matching::{InlierMatch, MatchedView, PlaceCandidates, ViewKeypoints};
+pub use matching::{Candidates, InlierMatch, MatchedView, ViewKeypoints};
 pub use noise::{Trial, TrialRecording, fitted_noise, squared_length, trials};
 pub use parameters::{MappingParameters, MatchingParameters};
-pub use retrieval::UnitFeatures;
+pub use retrieval::PlaceIndex;
 
 /// Why a keypoint map cannot be computed.
 #[derive(Debug, thiserror::Error, Clone, PartialEq)]

@@ -2,13 +2,12 @@
 //! and the noise under which the errors are most probable is found.
 
 use nalgebra::{Cholesky, Matrix6, Vector4, Vector6};
-use ndarray::ArrayView2;
 
 use super::absolute_pose::{MapNoise, PoseInformation};
 use super::keypoint_map::{KeypointMap, Mapping};
-use super::matching::{PlaceCandidates, ViewKeypoints};
+use super::matching::{Candidates, ViewKeypoints};
 use super::parameters::{MappingParameters, MatchingParameters};
-use super::retrieval::UnitFeatures;
+use super::retrieval::PlaceIndex;
 use seese3_core::geometry::{CameraIntrinsics, Pose, log};
 use seese3_core::keypoints::Keypoints;
 
@@ -31,8 +30,6 @@ pub struct TrialRecording<'a> {
     pub poses: &'a [Pose],
     /// Keypoints.
     pub keypoints: &'a [Keypoints],
-    /// Features for retrieval, shape (n, d).
-    pub features: ArrayView2<'a, f32>,
     /// The camera.
     pub camera: CameraIntrinsics,
 }
@@ -109,7 +106,6 @@ fn trials_of(recording: TrialRecording<'_>, pattern: LeftOut) -> Vec<Trial> {
     let TrialRecording {
         poses,
         keypoints,
-        features,
         camera,
     } = recording;
     let frame_count = poses.len();
@@ -130,23 +126,19 @@ fn trials_of(recording: TrialRecording<'_>, pattern: LeftOut) -> Vec<Trial> {
     };
 
     let map = mapping.map(&|| ());
-    let places = UnitFeatures::of(features.select(ndarray::Axis(0), &mapped).view());
+    let places = PlaceIndex::of(&map);
     let parameters = MatchingParameters::default();
     let every = asked.len().div_ceil(VIEWS).max(1);
     asked
         .iter()
         .step_by(every)
         .filter_map(|&row| {
-            let feature = features.row(row);
-            let candidates = places.nearest(feature, parameters.more_frames);
             let found = map.match_view(
                 ViewKeypoints {
                     keypoints: &keypoints[row],
                     camera: &camera,
                 },
-                PlaceCandidates {
-                    frames: &candidates,
-                },
+                Candidates::Similar(&places),
                 &mapped_poses,
                 &parameters,
             )?;

@@ -1,28 +1,55 @@
-//! Retrieval of the mapped frames most similar to a view, by the cosine of their features.
+//! Retrieval of the mapped frames most similar to a view, by aggregated keypoint descriptors.
+//!
+//! Each descriptor is assigned to its nearest of some centers, and the residuals are summed per
+//! center (VLAD). Source: R. Arandjelović and A. Zisserman, "All about VLAD", CVPR 2013.
 
-use ndarray::{Array2, ArrayView1, ArrayView2};
+use ndarray::{Array2, ArrayView2, Axis, s};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
 
-/// Features of mapped frames, scaled to unit length.
+use super::descriptors::{COMPRESSED, unpacked};
+use super::keypoint_map::{KeypointMap, MappedKeypoints};
+
+/// Number of centers.
+const CENTERS: usize = 64;
+/// Number of descriptors from which the centers are computed, and steps of k-means.
+const SAMPLE: usize = 10_000;
+const STEPS: usize = 8;
+/// Seed of the first centers.
+const SEED: u64 = 1;
+
+/// The aggregated descriptors of mapped frames.
 #[derive(Debug, Clone)]
-pub struct UnitFeatures {
+pub struct PlaceIndex {
+    /// Shape (centers, [`COMPRESSED`]).
+    centers: Array2<f32>,
+    /// One row of unit length per frame.
     rows: Array2<f32>,
 }
 
-impl UnitFeatures {
-    /// Scales features, shape (n, d).
-    pub fn of(features: ArrayView2<'_, f32>) -> Self {
-        let mut rows = features.to_owned();
-        for mut row in rows.rows_mut() {
-            let length = row.dot(&row).sqrt().max(1e-12);
-            row /= length;
-        }
+impl PlaceIndex {
+    /// Aggregates the descriptors of all frames of a map, on the threads of the calling rayon pool.
+    pub fn of(map: &KeypointMap) -> Self {
+        let centers = centers(&map.frames);
+        let width = centers.len();
+        let aggregated: Vec<Vec<f32>> = map
+            .frames
+            .par_iter()
+            .map(|frame| aggregated(unpacked(&frame.descriptors).view(), centers.view()))
+            .collect();
+        let rows = Array2::from_shape_fn((aggregated.len(), width), |(row, column)| {
+            aggregated[row][column]
+        });
 
-        Self { rows }
+        Self { centers, rows }
     }
 
-    /// Rows of the `count` most similar frames, the most similar first.
-    pub fn nearest(&self, feature: ArrayView1<'_, f32>, count: usize) -> Vec<usize> {
-        let similarity = self.rows.dot(&feature);
+    /// Rows of the `count` frames most similar to a view with these compressed descriptors, the most
+    /// similar first.
+    pub fn nearest(&self, descriptors: ArrayView2<'_, f32>, count: usize) -> Vec<usize> {
+        let view = aggregated(descriptors, self.centers.view());
+        let similarity = self.rows.dot(&ndarray::aview1(&view));
         let mut order: Vec<usize> = (0..similarity.len()).collect();
         let by_similarity =
             |a: &usize, b: &usize| similarity[*b].total_cmp(&similarity[*a]).then(a.cmp(b));
@@ -33,10 +60,89 @@ impl UnitFeatures {
         order.sort_by(by_similarity);
         order
     }
+}
 
-    /// Cosine similarity of the frame in `row` and a feature of shape (d).
-    pub fn similarity(&self, row: usize, feature: ArrayView1<'_, f32>) -> f32 {
-        let length = feature.dot(&feature).sqrt().max(1e-12);
-        self.rows.row(row).dot(&feature) / length
+/// Centers of the descriptors of a map: k-means from randomly chosen descriptors.
+fn centers(frames: &[MappedKeypoints]) -> Array2<f32> {
+    let count: usize = frames.iter().map(MappedKeypoints::len).sum();
+    let every = count.div_ceil(SAMPLE).max(1);
+    let sample: Vec<i8> = frames
+        .iter()
+        .flat_map(|frame| frame.descriptors.chunks(COMPRESSED))
+        .step_by(every)
+        .flatten()
+        .copied()
+        .collect();
+    let sample = unpacked(&sample);
+    if sample.nrows() == 0 {
+        return Array2::zeros((1, COMPRESSED));
     }
+
+    let mut rng = ChaCha8Rng::seed_from_u64(SEED);
+    let chosen: Vec<usize> = (0..CENTERS)
+        .map(|_| rng.random_range(0..sample.nrows()))
+        .collect();
+    let mut centers = sample.select(Axis(0), &chosen);
+    for _ in 0..STEPS {
+        let nearest = assignments(sample.view(), centers.view());
+        let mut sums = Array2::<f32>::zeros(centers.dim());
+        let mut counts = vec![0.0_f32; centers.nrows()];
+        for (row, &center) in sample.outer_iter().zip(&nearest) {
+            sums.row_mut(center).scaled_add(1.0, &row);
+            counts[center] += 1.0;
+        }
+        for (mut center, (sum, &count)) in
+            centers.outer_iter_mut().zip(sums.outer_iter().zip(&counts))
+        {
+            if count > 0.0 {
+                center.assign(&(&sum / count));
+            }
+        }
+    }
+
+    centers
+}
+
+/// The nearest center of each row.
+fn assignments(rows: ArrayView2<'_, f32>, centers: ArrayView2<'_, f32>) -> Vec<usize> {
+    // |x − c|² = |x|² − 2 x·c + |c|², and |x|² is the same for all centers.
+    let products = rows.dot(&centers.t());
+    let half_lengths: Vec<f32> = centers
+        .outer_iter()
+        .map(|center| 0.5 * center.dot(&center))
+        .collect();
+    products
+        .outer_iter()
+        .map(|row| {
+            let mut best = (0, f32::NEG_INFINITY);
+            for (center, (product, half)) in row.iter().zip(&half_lengths).enumerate() {
+                if product - half > best.1 {
+                    best = (center, product - half);
+                }
+            }
+            best.0
+        })
+        .collect()
+}
+
+/// Aggregated descriptors: residuals summed per center, each sum of unit length, together of unit
+/// length.
+fn aggregated(descriptors: ArrayView2<'_, f32>, centers: ArrayView2<'_, f32>) -> Vec<f32> {
+    let mut sums = Array2::<f32>::zeros(centers.dim());
+    for (row, center) in descriptors
+        .outer_iter()
+        .zip(assignments(descriptors, centers))
+    {
+        let residual = &row - &centers.row(center);
+        sums.slice_mut(s![center, ..]).scaled_add(1.0, &residual);
+    }
+
+    for mut sum in sums.rows_mut() {
+        let length = sum.dot(&sum).sqrt();
+        if length > 0.0 {
+            sum /= length;
+        }
+    }
+    let length = sums.iter().map(|x| x * x).sum::<f32>().sqrt().max(1e-12);
+    sums.iter().map(|x| x / length).collect()
 }
