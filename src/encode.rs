@@ -62,6 +62,10 @@ pub struct Encode {
 }
 
 impl Encode {
+    #[expect(
+        clippy::too_many_lines,
+        reason = "one command, from its arguments to what it prints"
+    )]
     pub async fn run(self) -> anyhow::Result<()> {
         let store = self.common.open()?;
         let runtime = self.runtime.runtime();

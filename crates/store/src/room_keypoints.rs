@@ -11,7 +11,6 @@ use serde::{Deserialize, Serialize};
 use super::Error;
 use super::manifest::ObjectRef;
 use super::tensors::{TensorReader, TensorWriter};
-use seese3_core::Cause;
 use seese3_core::geometry::CameraIntrinsics;
 use seese3_core::keypoints::KeypointSource;
 use seese3_core::nalgebra::Vector2;
@@ -120,122 +119,141 @@ pub fn read_keypoints(
     entry: KeypointsEntry,
     frame_count: usize,
 ) -> Result<RoomKeypoints, Error> {
-    let damaged = |problem: Cause| Error::Damaged {
+    let damaged = |problem: String| Error::Damaged {
         file: file.to_owned(),
-        problem,
+        problem: problem.into(),
     };
-    let KeypointsEntry {
-        source,
-        camera,
-        unit_m,
-        epipolar_px,
-        noise,
-        ..
-    } = entry;
-    let is_positive = |value: f64| value.is_finite() && value > 0.0;
-    let MapNoise {
-        translation_m,
-        rotation_rad,
-        design_effect,
-        gap_scale,
-    } = noise;
-    let numbers = [
-        unit_m,
-        epipolar_px,
-        translation_m,
-        rotation_rad,
-        design_effect,
-        gap_scale,
-    ];
-    if !numbers.into_iter().all(is_positive) {
-        return Err(damaged(
-            format!(
-                "unit, epipolar error and noise of the map must be above 0, but are {numbers:?}"
-            )
-            .into(),
-        ));
-    }
 
+    entry.check().map_err(damaged)?;
     let tensors = TensorReader::new(file, bytes)?;
-    let counts = tensors.i64("counts")?;
-    let positions = tensors.u16("positions")?;
-    let inverse_depths = tensors.u16("inverse_depths")?;
-    let deviations = tensors.u8("deviations")?;
-    let descriptors = tensors.i8("descriptors")?;
+    let columns = Columns::read(&tensors)?;
+    columns.check(frame_count).map_err(damaged)?;
 
-    // Tensors of the right types may still contradict each other.
-    let count = positions.nrows();
-    let total: Option<i64> = counts
-        .iter()
-        .try_fold(0_i64, |sum, &n| sum.checked_add(n).filter(|_| n >= 0));
-    let is_consistent = counts.len() == frame_count
-        && total == Some(count as i64)
-        && positions.ncols() == 2
-        && inverse_depths.len() == count
-        && deviations.len() == count
-        && descriptors.dim() == (count, COMPRESSED);
-    if !is_consistent {
-        return Err(damaged(
-            format!(
-                "has keypoints of {} frames whose tensors contradict each other; the room has {frame_count} frames",
-                counts.len()
-            )
-            .into(),
-        ));
-    }
-
-    let mean = tensors.f32("basis.mean")?;
-    let mean = Array1::from_iter(mean.iter().copied());
-    let axes: Array2<f32> = tensors.f32("basis.axes")?;
-    let basis = DescriptorBasis::from_parts(mean, axes)
-        .ok_or_else(|| damaged("has a descriptor basis of a wrong shape".into()))?;
-
-    let scale = MOST_INVERSE_DEPTH / f64::from(u16::MAX) / unit_m;
-    let steps = f32::from(u8::MAX) / MOST_DEVIATION;
-    let [inverse_depths, deviations] = [
-        inverse_depths
-            .iter()
-            .map(|&n| (f64::from(n.max(1)) * scale) as f32)
-            .collect::<Vec<_>>(),
-        deviations
-            .iter()
-            .map(|&n| f32::from(n.max(1)) / steps)
-            .collect(),
-    ];
-
-    let mut frames = Vec::with_capacity(frame_count);
-    let mut from = 0;
-    for &n in &counts {
-        let rows = from..from + n as usize;
-        let points = positions
-            .rows()
-            .into_iter()
-            .skip(rows.start)
-            .take(rows.len())
-            .map(|row| Vector2::new(f32::from(row[0]), f32::from(row[1])) / POSITION_STEPS);
-        frames.push(MappedKeypoints {
-            points: points.collect(),
-            inverse_depths: inverse_depths[rows.clone()].to_vec(),
-            deviations: deviations[rows.clone()].to_vec(),
-            descriptors: descriptors
-                .slice(ndarray::s![rows.clone(), ..])
-                .iter()
-                .copied()
-                .collect(),
-        });
-        from = rows.end;
-    }
+    let mean = Array1::from_iter(tensors.f32("basis.mean")?.iter().copied());
+    let basis = DescriptorBasis::from_parts(mean, tensors.f32("basis.axes")?)
+        .ok_or_else(|| damaged("has a descriptor basis of a wrong shape".to_owned()))?;
 
     let map = KeypointMap {
-        camera,
-        unit_m,
-        epipolar_px,
-        noise,
+        camera: entry.camera,
+        unit_m: entry.unit_m,
+        epipolar_px: entry.epipolar_px,
+        noise: entry.noise,
         basis,
-        frames,
+        frames: columns.frames(entry.unit_m),
     };
     Ok(RoomKeypoints {
-        source,
+        source: entry.source,
         map: Arc::new(map),
     })
+}
+
+impl KeypointsEntry {
+    /// Checks that the numbers are those of a map.
+    fn check(&self) -> Result<(), String> {
+        let MapNoise {
+            translation_m,
+            rotation_rad,
+            design_effect,
+            gap_scale,
+        } = self.noise;
+        let numbers = [
+            self.unit_m,
+            self.epipolar_px,
+            translation_m,
+            rotation_rad,
+            design_effect,
+            gap_scale,
+        ];
+
+        let is_positive = |value: &f64| value.is_finite() && *value > 0.0;
+        if numbers.iter().all(is_positive) {
+            Ok(())
+        } else {
+            Err(format!(
+                "unit, epipolar error and noise of the map must be above 0, but are {numbers:?}"
+            ))
+        }
+    }
+}
+
+/// The tensors with one entry per frame or per keypoint.
+struct Columns {
+    counts: Array2<i64>,
+    positions: Array2<u16>,
+    inverse_depths: Array2<u16>,
+    deviations: Array2<u8>,
+    descriptors: Array2<i8>,
+}
+
+impl Columns {
+    fn read(tensors: &TensorReader<'_>) -> Result<Self, Error> {
+        Ok(Self {
+            counts: tensors.i64("counts")?,
+            positions: tensors.u16("positions")?,
+            inverse_depths: tensors.u16("inverse_depths")?,
+            deviations: tensors.u8("deviations")?,
+            descriptors: tensors.i8("descriptors")?,
+        })
+    }
+
+    /// Checks the shapes against each other: tensors of the right types may still contradict.
+    fn check(&self, frame_count: usize) -> Result<(), String> {
+        let count = self.positions.nrows();
+        let total: Option<i64> = self
+            .counts
+            .iter()
+            .try_fold(0_i64, |sum, &n| sum.checked_add(n).filter(|_| n >= 0));
+        let is_consistent = self.counts.len() == frame_count
+            && total == Some(count as i64)
+            && self.positions.ncols() == 2
+            && self.inverse_depths.len() == count
+            && self.deviations.len() == count
+            && self.descriptors.dim() == (count, COMPRESSED);
+
+        if is_consistent {
+            Ok(())
+        } else {
+            Err(format!(
+                "has keypoints of {} frames whose tensors contradict each other; the room has {frame_count} frames",
+                self.counts.len()
+            ))
+        }
+    }
+
+    /// The keypoints of each frame. `unit_m` is the median depth, meters.
+    fn frames(&self, unit_m: f64) -> Vec<MappedKeypoints> {
+        let scale = MOST_INVERSE_DEPTH / f64::from(u16::MAX) / unit_m;
+        let inverse_depths: Vec<f32> = self
+            .inverse_depths
+            .iter()
+            .map(|&n| (f64::from(n.max(1)) * scale) as f32)
+            .collect();
+        let steps = f32::from(u8::MAX) / MOST_DEVIATION;
+        let deviations: Vec<f32> = self
+            .deviations
+            .iter()
+            .map(|&n| f32::from(n.max(1)) / steps)
+            .collect();
+        let points: Vec<Vector2<f32>> = self
+            .positions
+            .outer_iter()
+            .map(|row| Vector2::new(f32::from(row[0]), f32::from(row[1])) / POSITION_STEPS)
+            .collect();
+
+        let mut frames = Vec::with_capacity(self.counts.len());
+        let mut from = 0;
+        for &n in &self.counts {
+            let rows = from..from + n as usize;
+            from = rows.end;
+            let descriptors = self.descriptors.slice(ndarray::s![rows.clone(), ..]);
+            frames.push(MappedKeypoints {
+                points: points[rows.clone()].to_vec(),
+                inverse_depths: inverse_depths[rows.clone()].to_vec(),
+                deviations: deviations[rows].to_vec(),
+                descriptors: descriptors.iter().copied().collect(),
+            });
+        }
+
+        frames
+    }
 }

@@ -101,6 +101,23 @@ pub(super) enum PublishPolicy {
     Revision(u64),
 }
 
+/// The body of a new revision's manifest.
+fn room_body(room: &Room, objects: &RoomObjects, revision: u64) -> RoomBody {
+    RoomBody {
+        schema: SCHEMA,
+        room: room.id().to_string(),
+        revision,
+        created: chrono::Utc::now().to_rfc3339(),
+        frame_count: room.frame_count(),
+        frames: objects.frames.clone(),
+        frame_names: objects.frame_names.clone(),
+        images: objects.images.clone(),
+        features: objects.features.clone(),
+        keypoints: objects.keypoints.clone(),
+        provenance: room.provenance().clone(),
+    }
+}
+
 /// The newest revision, if it equals `body` except for the revision number and the date.
 fn unchanged(folder: &Path, body: &RoomBody, newest: Option<RoomBody>) -> Option<Published> {
     let newest = newest?;
@@ -229,19 +246,7 @@ impl Store {
                 None => None,
             };
 
-            let mut body = RoomBody {
-                schema: SCHEMA,
-                room: room.id().to_string(),
-                revision: numbers.highest + 1,
-                created: chrono::Utc::now().to_rfc3339(),
-                frame_count: room.frame_count(),
-                frames: objects.frames.clone(),
-                frame_names: objects.frame_names.clone(),
-                images: objects.images.clone(),
-                features: objects.features.clone(),
-                keypoints: objects.keypoints.clone(),
-                provenance: room.provenance().clone(),
-            };
+            let mut body = room_body(room, &objects, numbers.highest + 1);
 
             // Row i of the features belongs to frame i, so earlier features remain valid while the
             // poses are the same.
