@@ -213,9 +213,7 @@ impl Encode {
         camera: CameraIntrinsics,
     ) -> anyhow::Result<KeypointMap> {
         let poses = room.frames().select(&encoded.good).poses;
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(self.runtime.threads())
-            .build()?;
+        let pool = self.runtime.pool()?;
         pool.install(|| {
             map_keypoints(TrialRecording {
                 poses: &poses,
@@ -278,9 +276,7 @@ impl Encode {
 
         // Decoding, encoding and tract all run on this pool, so that --threads limits them
         // together.
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(self.runtime.threads())
-            .build()?;
+        let pool = self.runtime.pool()?;
 
         let told = |done: usize| progress.set_position(done as u64);
         let encoded = pool.install(|| encode_room(&task, encoder, Some(kept), &told));

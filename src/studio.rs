@@ -164,9 +164,7 @@ impl Studio {
         encoder: &Encoder,
         sources: &[FeatureSource],
     ) -> anyhow::Result<(u32, u32, Spent)> {
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(self.runtime.threads())
-            .build()?;
+        let pool = self.runtime.pool()?;
 
         let progress = bar(u64::from(self.rooms) * self.frame_count() as u64, "drawing");
         let mut spent = Spent::default();
