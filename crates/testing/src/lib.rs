@@ -7,6 +7,7 @@
     reason = "a failed step is a failed test"
 )]
 
+pub mod keypoint_scene;
 pub mod oracle_room;
 pub mod recording;
 #[cfg(feature = "world")]

@@ -377,3 +377,110 @@ impl PoseInformation {
         Some((covariance + covariance.transpose()) * 0.5)
     }
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a failed step is a failed test")]
+mod tests {
+    use nalgebra::{Vector2, Vector3};
+    use seese3_core::geometry::log;
+    use seese3_testing::{golden, json, number, pose};
+    use serde_json::Value;
+
+    use super::*;
+
+    fn numbers(value: &Value) -> Vec<f64> {
+        match value {
+            Value::Array(values) => values.iter().flat_map(numbers).collect(),
+            number_value => vec![number(number_value)],
+        }
+    }
+
+    fn matches_of(case: &Value) -> Vec<Correspondence> {
+        let world = numbers(&case["world"]);
+        let plane = numbers(&case["plane"]);
+        let points = world.chunks_exact(3).zip(plane.chunks_exact(2));
+        points
+            .enumerate()
+            .map(|(keypoint, (world, plane))| Correspondence {
+                keypoint,
+                frame: 0,
+                plane: Vector2::from_column_slice(plane),
+                world: Vector3::from_column_slice(world),
+                from_frame: Vector3::z(),
+                deviation: 0.0,
+            })
+            .collect()
+    }
+
+    fn search(case: &Value, focal_px: f64, seed: u64) -> Search {
+        Search {
+            focal_px,
+            threshold_px: number(&case["threshold_px"]),
+            deviation_px: 0.7,
+            iterations: [100, 1_000],
+            miss_probability: 1e-4,
+            seed,
+        }
+    }
+
+    /// Oracle: PoseLib on the same correspondences (`tests/golden/absolute_pose`). With noise, the two
+    /// losses differ, and the poses agree within a standard deviation.
+    #[test]
+    fn the_pose_is_that_of_poselib() {
+        let file = json(&golden().join("absolute_pose/expected.json"));
+        for case in file["cases"].as_array().unwrap() {
+            let name = case["name"].as_str().unwrap();
+            let matches = matches_of(case);
+            let expected = pose(&numbers(&case["world_from_camera"]));
+            let depth = number(&case["median_depth"]);
+            for seed in 0..5 {
+                let search = search(case, number(&file["focal_px"]), seed);
+                let found = find_pose(&matches, &search).unwrap();
+                let off = log(&found.pose.inv_mul(&expected));
+                if name.starts_with("exact") {
+                    assert!(off.linear.norm() < 1e-6 * depth, "{name}: {off:?}");
+                    assert!(off.angular.norm() < 1e-6, "{name}: {off:?}");
+                    // PoseLib counts inliers before its last refinement.
+                    let count = found.inliers.len() as f64;
+                    assert!((count - number(&case["inliers"])).abs() < 2.0, "{name}");
+                } else {
+                    let off = off.to_vector();
+                    let squared = off.dot(&(found.information * off));
+                    assert!(squared < 1.0, "{name}: {squared}");
+                }
+            }
+        }
+    }
+
+    /// Oracle: the definition. A pose has 6 degrees of freedom, which three points of one line, one
+    /// point and numbers that are not finite do not determine.
+    #[test]
+    fn degenerate_matches_give_no_pose_that_many_agree_with() {
+        let file = json(&golden().join("absolute_pose/expected.json"));
+        let case = &file["cases"][1];
+        let search = search(case, number(&file["focal_px"]), 1);
+        let matches = matches_of(case);
+
+        assert!(find_pose(&[], &search).is_none());
+        assert!(find_pose(&matches[..3], &search).is_none());
+        let changed = |change: &dyn Fn(&mut Correspondence)| {
+            let mut changed = matches.clone();
+            changed.iter_mut().for_each(change);
+            find_pose(&changed, &search)
+        };
+
+        // One keypoint; one map point.
+        assert!(changed(&|match_| match_.keypoint = 0).is_none());
+        assert!(changed(&|match_| match_.world = Vector3::z()).is_none());
+        let on_a_line = changed(&|match_| match_.world = Vector3::x() * match_.world.x);
+        assert!(on_a_line.is_none_or(|found| found.inliers.len() < matches.len() / 2));
+        for bad in [f64::NAN, f64::INFINITY, 1e300] {
+            assert!(changed(&|match_| match_.world.x = bad).is_none_or(|found| {
+                found.inliers.is_empty() || found.pose.translation.vector.norm().is_finite()
+            }));
+            assert!(changed(&|match_| match_.plane.x = bad).is_none_or(|found| {
+                found.inliers.is_empty() || found.pose.translation.vector.norm().is_finite()
+            }));
+        }
+    }
+}

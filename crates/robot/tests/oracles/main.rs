@@ -8,5 +8,6 @@
 )]
 
 mod fitting;
+mod matched_views;
 mod multi_step;
 mod tracking;

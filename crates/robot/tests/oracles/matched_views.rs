@@ -1,0 +1,517 @@
+//! Matched views of scenes with known points and poses.
+
+use std::sync::Arc;
+
+use nalgebra::{Matrix6, Point3, Vector3, Vector6};
+use seese3_core::geometry::{CameraIntrinsics, Pose, PoseError, log};
+use seese3_core::keypoints::Keypoints;
+use seese3_core::statistics::coverage;
+use seese3_robot::localization::{KeypointQuery, KeypointRoom, LocatedView, NotLocated};
+use seese3_robot::matched_views::{
+    Error, KeypointMap, MapNoise, Mapping, MappingParameters, PoseInformation, Trial,
+    TrialRecording, fitted_noise, squared_length as squared_length_of,
+};
+use seese3_testing::keypoint_scene::{
+    Random, Scene, SceneView, camera_path, distorted_camera, place_features,
+};
+use seese3_testing::near;
+
+/// Number of mapped frames of most tests.
+const FRAMES: usize = 40;
+/// Number of points of most scenes; a view sees more than half of them.
+const POINTS: usize = 600;
+
+/// A scene with the keypoints of mapped cameras.
+struct World {
+    scene: Scene,
+    camera: CameraIntrinsics,
+    poses: Vec<Pose>,
+    views: Vec<SceneView>,
+}
+
+impl World {
+    fn new(scene: Scene, poses: Vec<Pose>, noise_px: f64) -> Self {
+        let camera = distorted_camera();
+        let mut random = Random::new(3);
+        let views = poses
+            .iter()
+            .map(|pose| scene.view(pose, &camera, noise_px, &mut random))
+            .collect();
+        Self {
+            scene,
+            camera,
+            poses,
+            views,
+        }
+    }
+
+    fn exact() -> Self {
+        Self::new(Scene::in_box(POINTS, 1), camera_path(FRAMES), 0.0)
+    }
+
+    fn keypoints(&self) -> Vec<Keypoints> {
+        self.views
+            .iter()
+            .map(|view| view.keypoints.clone())
+            .collect()
+    }
+
+    /// The map under the stated poses and camera.
+    fn map(&self, stated: &[Pose], camera: CameraIntrinsics) -> KeypointMap {
+        let keypoints = self.keypoints();
+        let parameters = MappingParameters::default();
+        let mapping = Mapping::new(stated, &keypoints, camera, parameters).unwrap();
+        mapping.map(&|| ())
+    }
+
+    fn room(&self) -> KeypointRoom {
+        self.room_of(&self.poses, self.map(&self.poses, self.camera))
+    }
+
+    fn room_of(&self, stated: &[Pose], map: KeypointMap) -> KeypointRoom {
+        let features = place_features(&self.poses);
+        KeypointRoom::new(stated.to_vec(), features.view(), Arc::new(map))
+    }
+}
+
+/// Views between and beside the mapped frames of [`camera_path`].
+fn new_poses(count: usize) -> Vec<Pose> {
+    let mut random = Random::new(17);
+    camera_path(count)
+        .iter()
+        .map(|pose| pose * Pose::new(random.normals() * 0.05, random.normals() * 0.05))
+        .collect()
+}
+
+/// Locates the keypoints of a view that has the features of `pose`.
+fn located(
+    room: &KeypointRoom,
+    keypoints: &Keypoints,
+    pose: &Pose,
+    camera: &CameraIntrinsics,
+) -> Result<LocatedView, NotLocated> {
+    let features = place_features(&[*pose]);
+    room.locate(KeypointQuery {
+        feature: features.row(0),
+        keypoints,
+        camera,
+    })
+}
+
+/// Squared Mahalanobis length of the error of a located view.
+fn squared_length(found: &LocatedView, truth: &Pose) -> f64 {
+    let error = log(&found.pose.pose.inv_mul(truth)).to_vector();
+    let covariance = found.pose.covariance.cholesky().unwrap();
+    error.dot(&covariance.solve(&error))
+}
+
+/// The keypoints of a view with the descriptors of every second keypoint moved on to the next such
+/// keypoint.
+fn with_half_exchanged(view: &SceneView, scene: &Scene) -> Keypoints {
+    let places: Vec<usize> = (0..view.shown.len()).collect();
+    let exchanged: Vec<usize> = places
+        .iter()
+        .map(|&place| {
+            let next = if place % 2 == 0 { place + 2 } else { place };
+            view.shown[if next < places.len() { next } else { 0 }]
+        })
+        .collect();
+    let descriptors = scene.descriptors.select(ndarray::Axis(0), &exchanged);
+    Keypoints::new(
+        view.keypoints.points(),
+        view.keypoints.scores(),
+        descriptors.view(),
+    )
+}
+
+/// Oracle: the depths of the scene's points in the cameras that see them.
+#[test]
+fn mapped_inverse_depths_are_those_of_the_scene() {
+    let world = World::exact();
+    let map = world.map(&world.poses, world.camera);
+
+    let mut depths = Vec::new();
+    for ((mapped, view), pose) in map.frames.iter().zip(&world.views).zip(&world.poses) {
+        assert!(mapped.len() >= 200, "{} keypoints are mapped", mapped.len());
+        for (point, &inverse_depth) in mapped.points.iter().zip(&mapped.inverse_depths) {
+            let place = view
+                .keypoints
+                .points()
+                .iter()
+                .position(|seen| seen == point);
+            let shown = world.scene.points[view.shown[place.unwrap()]];
+            let depth = pose.inverse_transform_point(&Point3::from(shown)).z;
+            near(
+                "inverse depth × depth",
+                f64::from(inverse_depth) * depth,
+                1.0,
+                1e-3,
+            );
+            depths.push(depth);
+        }
+    }
+
+    let median = seese3_core::statistics::median(&depths);
+    near("unit", map.unit_m, median, 0.1 * median);
+    assert!(map.epipolar_px < 1e-3, "{} px", map.epipolar_px);
+}
+
+/// Oracle: the poses from which the views are computed.
+#[test]
+fn a_view_with_exact_keypoints_is_located_within_a_millimeter() {
+    let world = World::exact();
+    let room = world.room();
+    let mut random = Random::new(5);
+    for pose in new_poses(15) {
+        let view = world.scene.view(&pose, &world.camera, 0.0, &mut random);
+        let found = located(&room, &view.keypoints, &pose, &world.camera).unwrap();
+        let error = PoseError::between(&pose, &found.pose.pose);
+        assert!(
+            error.translation_m < 1e-3 && error.rotation_rad < 1e-3,
+            "{error:?}"
+        );
+
+        let again = room
+            .locate_near(
+                KeypointQuery {
+                    feature: place_features(&[pose]).row(0),
+                    keypoints: &view.keypoints,
+                    camera: &world.camera,
+                },
+                &pose,
+            )
+            .unwrap();
+        let error = PoseError::between(&pose, &again.pose.pose);
+        assert!(
+            error.translation_m < 1e-3 && error.rotation_rad < 1e-3,
+            "{error:?}"
+        );
+    }
+}
+
+/// Oracle: the definition of a covariance. Squared Mahalanobis lengths of errors in six dimensions
+/// have the mean 6; a mean of 40 has the standard deviation 0.55. The fit with heavy tails may state
+/// up to 1.7 times the variance of normal errors.
+#[test]
+fn errors_under_pixel_noise_agree_with_the_covariance() {
+    let world = World::new(Scene::in_box(POINTS, 1), camera_path(80), 0.5);
+    let mut map = world.map(&world.poses, world.camera);
+    let keypoints = world.keypoints();
+    let features = place_features(&world.poses);
+    map.measure_noise(TrialRecording {
+        poses: &world.poses,
+        keypoints: &keypoints,
+        features: features.view(),
+        camera: world.camera,
+    });
+    let room = world.room_of(&world.poses, map);
+
+    let mut random = Random::new(6);
+    for is_exchanged in [false, true] {
+        let mut lengths = Vec::new();
+        let mut worst = 0.0_f64;
+        for pose in new_poses(40) {
+            let view = world.scene.view(&pose, &world.camera, 0.5, &mut random);
+            let keypoints = if is_exchanged {
+                with_half_exchanged(&view, &world.scene)
+            } else {
+                view.keypoints.clone()
+            };
+            let found = located(&room, &keypoints, &pose, &world.camera).unwrap();
+            worst = worst.max(PoseError::between(&pose, &found.pose.pose).translation_m);
+            lengths.push(squared_length(&found, &pose));
+        }
+
+        let mean = seese3_core::statistics::mean(&lengths);
+        let longest = lengths.iter().copied().fold(0.0, f64::max).sqrt();
+        assert!((2.0..9.0).contains(&mean), "mean squared length {mean}");
+        assert!(longest < 6.0, "{longest} standard deviations");
+        assert!(worst < 0.03, "{worst} m");
+    }
+}
+
+/// A view of the world's scene and its result in a room.
+fn result_of(world: &World, room: &KeypointRoom, pose: &Pose) -> Result<LocatedView, NotLocated> {
+    let view = world
+        .scene
+        .view(pose, &world.camera, 0.0, &mut Random::new(8));
+    located(room, &view.keypoints, pose, &world.camera)
+}
+
+/// Fails unless the view is refused as not in the map.
+#[track_caller]
+fn assert_not_in_map(result: Result<LocatedView, NotLocated>) {
+    assert!(
+        matches!(result, Err(NotLocated::NotInMap { .. })),
+        "{result:?}"
+    );
+}
+
+/// Oracle: the definitions of the refusals.
+#[test]
+fn without_keypoints_there_is_neither_a_map_nor_a_pose() {
+    let none = Keypoints::default();
+    let camera = distorted_camera();
+    for count in [0, 5] {
+        let poses = camera_path(count);
+        let keypoints = vec![none.clone(); count];
+        let mapping = Mapping::new(&poses, &keypoints, camera, MappingParameters::default());
+        assert_eq!(mapping.err(), Some(Error::NoDescriptors));
+    }
+
+    let world = World::exact();
+    let refused = located(&world.room(), &none, &world.poses[0], &camera);
+    assert_eq!(refused.unwrap_err(), NotLocated::NoKeypoints);
+}
+
+/// Oracle: depth needs views from two places. One camera, cameras in one place and cameras that only
+/// turn have none; points at infinity look the same from everywhere.
+#[test]
+fn a_map_without_a_baseline_has_no_depths() {
+    let one_place: Vec<Pose> = vec![Pose::identity(); 12];
+    let turning: Vec<Pose> = (0..12)
+        .map(|at| Pose::new(Vector3::zeros(), Vector3::y() * (0.02 * f64::from(at))))
+        .collect();
+    let infinite: Vec<Vector3<f64>> = Scene::in_box(POINTS, 1)
+        .points
+        .iter()
+        .map(|point| point * 1e7)
+        .collect();
+
+    let near = || Scene::in_box(POINTS, 1);
+    for (name, scene, poses) in [
+        ("one frame", near(), camera_path(1)),
+        ("one place", near(), one_place),
+        ("turning", near(), turning),
+        ("infinity", Scene::of(infinite, 2), camera_path(FRAMES)),
+    ] {
+        let world = World::new(scene, poses, 0.0);
+        let map = world.map(&world.poses, world.camera);
+        let count: usize = map.frames.iter().map(|frame| frame.len()).sum();
+        assert_eq!(count, 0, "{name}");
+
+        let room = world.room_of(&world.poses, map);
+        let moved = Pose::new(Vector3::new(0.05, 0.02, 0.0), Vector3::y() * 0.05);
+        assert_not_in_map(result_of(&world, &room, &moved));
+    }
+}
+
+/// Oracle: the true poses of the views. The positions of a camera that only turns differ by the noise
+/// of its poses; depths from such baselines must not place a view somewhere else.
+#[test]
+fn a_turning_camera_with_noisy_positions_gives_no_wrong_pose() {
+    for jitter_m in [1e-9, 1e-6, 1e-3, 5e-3] {
+        let mut random = Random::new(9);
+        let turn = |at: i32| Vector3::y() * (0.01 * f64::from(at) - 0.15);
+        let turning = (0..30).map(|at| Pose::new(Vector3::zeros(), turn(at)));
+        let world = World::new(Scene::in_box(POINTS, 1), turning.collect(), 0.3);
+        let mut stated = world.poses.clone();
+        for pose in &mut stated {
+            pose.translation.vector += random.normals() * jitter_m;
+        }
+
+        let room = world.room_of(&stated, world.map(&stated, world.camera));
+        for shift_m in [0.0, 0.01, 0.03, 0.1, 0.3] {
+            let moved = Pose::new(Vector3::x() * shift_m, Vector3::y() * 0.02);
+            if let Ok(found) = result_of(&world, &room, &moved) {
+                let error = PoseError::between(&moved, &found.pose.pose).translation_m;
+                let deviation = found.pose.position_deviation_m();
+                assert!(
+                    error < 4.0 * deviation,
+                    "{jitter_m}, {shift_m}: {error} m, deviation {deviation} m"
+                );
+            }
+        }
+    }
+}
+
+/// Oracle: the definition. Two frames do not tell how deep the scene is in baselines, so none is
+/// triangulated, and a view is refused.
+#[test]
+fn a_map_of_two_frames_refuses_views() {
+    let second = Pose::new(Vector3::x() * 0.4, Vector3::zeros());
+    let poses = vec![Pose::identity(), second];
+    let world = World::new(Scene::in_box(POINTS, 1), poses, 0.0);
+    let moved = Pose::new(Vector3::x() * 0.1, Vector3::y() * 0.02);
+    assert_not_in_map(result_of(&world, &world.room(), &moved));
+}
+
+/// Oracle: the true poses of the views. Three points of a plane determine a pose as any other.
+#[test]
+fn a_view_of_a_plane_is_located() {
+    let mut scene = Scene::in_box(POINTS, 1);
+    for point in &mut scene.points {
+        point.z = 4.0 + 0.2 * point.x;
+    }
+    let world = World::new(scene, camera_path(FRAMES), 0.0);
+    let room = world.room();
+    for pose in new_poses(8) {
+        let found = result_of(&world, &room, &pose).unwrap();
+        let error = PoseError::between(&pose, &found.pose.pose);
+        assert!(error.translation_m < 2e-3, "{error:?}");
+    }
+}
+
+/// Oracle: the true poses of the views.
+#[test]
+fn a_view_is_located_although_one_mapped_pose_in_ten_is_wrong() {
+    let world = World::exact();
+    let mut random = Random::new(10);
+    let mut stated = world.poses.clone();
+    for pose in stated.iter_mut().step_by(10) {
+        let shift = random.normals().normalize() * 0.5;
+        pose.translation.vector += shift;
+    }
+
+    let room = world.room_of(&stated, world.map(&stated, world.camera));
+    let mut answered = 0;
+    for pose in new_poses(30) {
+        match result_of(&world, &room, &pose) {
+            Ok(found) => {
+                answered += 1;
+                let error = PoseError::between(&pose, &found.pose.pose);
+                assert!(error.translation_m < 5e-3, "{error:?}");
+            }
+            Err(refused) => assert!(!matches!(refused, NotLocated::NoKeypoints)),
+        }
+    }
+    assert!(answered >= 20, "{answered} of 30 views are located");
+}
+
+/// Oracle: the view shows another scene. Points with the descriptors of the map in other places do
+/// not agree with it either.
+#[test]
+fn a_view_of_another_scene_is_refused() {
+    let world = World::exact();
+    let room = world.room();
+    let other = Scene::in_box(POINTS, 50);
+    let shuffled = Scene {
+        points: other.points.clone(),
+        ..world.scene.clone()
+    };
+    for scene in [other, shuffled] {
+        for pose in new_poses(8) {
+            let view = scene.view(&pose, &world.camera, 0.0, &mut Random::new(8));
+            assert_not_in_map(located(&room, &view.keypoints, &pose, &world.camera));
+        }
+    }
+}
+
+/// Fails if a located view is more than 6 standard deviations from its true pose. `cameras` are those
+/// that are stated for the map and for the view.
+#[track_caller]
+fn assert_no_confident_wrong_pose(world: &World, cameras: [CameraIntrinsics; 2]) {
+    let [of_map, of_view] = cameras;
+    let mut map = world.map(&world.poses, of_map);
+    let keypoints = world.keypoints();
+    let features = place_features(&world.poses);
+    map.measure_noise(TrialRecording {
+        poses: &world.poses,
+        keypoints: &keypoints,
+        features: features.view(),
+        camera: of_map,
+    });
+
+    let room = world.room_of(&world.poses, map);
+    for pose in new_poses(6) {
+        let view = world
+            .scene
+            .view(&pose, &world.camera, 0.5, &mut Random::new(8));
+        if let Ok(found) = located(&room, &view.keypoints, &pose, &of_view) {
+            let error = PoseError::between(&pose, &found.pose.pose).translation_m;
+            let length = squared_length(&found, &pose).sqrt();
+            assert!(
+                length < 6.0,
+                "{error:.3} m, {length:.1} standard deviations, {} inliers",
+                found.inliers
+            );
+        }
+    }
+}
+
+/// Oracle: the true poses of the views. If map and view state the same wrong focal length, errors
+/// partly cancel, and the trials of the map measure the rest.
+#[test]
+fn a_wrong_focal_length_of_map_and_view_is_part_of_the_covariance() {
+    let world = World::new(Scene::in_box(POINTS, 1), camera_path(FRAMES), 0.5);
+    for factor in [0.75, 1.25] {
+        let wrong = world.camera.zoomed(factor).unwrap();
+        assert_no_confident_wrong_pose(&world, [wrong, wrong]);
+    }
+}
+
+/// Oracle: the true poses of the views.
+#[test]
+#[ignore = "fails: a view with a focal length that is 25 % wrong is placed about 1.2 m along its axis, \
+            where a quarter to a half of its keypoints agree within the threshold; nothing compares \
+            the view's focal length with the map's"]
+fn a_wrong_focal_length_of_the_view_alone_gives_no_confident_wrong_pose() {
+    let world = World::new(Scene::in_box(POINTS, 1), camera_path(FRAMES), 0.5);
+    for factor in [0.75, 1.25] {
+        let wrong = world.camera.zoomed(factor).unwrap();
+        assert_no_confident_wrong_pose(&world, [world.camera, wrong]);
+    }
+}
+
+/// A trial with the given information; its error is drawn from Student's t distribution with 5 degrees
+/// of freedom and the covariance that `noise` gives.
+fn drawn_trial(information: PoseInformation, noise: &MapNoise, random: &mut Random) -> Trial {
+    let root = information.covariance(noise).unwrap().cholesky().unwrap();
+    let normal = Vector6::from_fn(|_, _| random.normal());
+    let chi_squared: f64 = (0..5).map(|_| random.normal().powi(2)).sum();
+
+    // A t variate normal · √(5 / χ²) has the variance 5 / 3.
+    let error = root.l() * normal * (3.0 / chi_squared).sqrt();
+    Trial { error, information }
+}
+
+/// Oracle: the noise from which the errors are drawn; and the F distribution: 6 F(6, 5) · 3/5 is below
+/// the two thresholds with the probabilities 0.759 and 0.905 (SciPy 1.18, `scipy.stats.f`).
+#[test]
+fn the_noise_of_drawn_trials_is_found() {
+    let unit_m = 2.0;
+    let truth = MapNoise {
+        translation_m: 0.004,
+        rotation_rad: 0.002,
+        design_effect: 8.0,
+        gap_scale: 0.15,
+    };
+
+    let mut random = Random::new(31);
+    let trials: Vec<Trial> = (0..2_000)
+        .map(|_| {
+            // Deviations of 0.2 to 5 mm, and of 1/2 of that in radians, with correlated axes.
+            let size = 2e-4 * 25.0_f64.powf(random.uniform());
+            let mut root = Matrix6::from_fn(|_, _| 0.3 * random.normal());
+            root += Matrix6::identity();
+            let scale = Vector6::new(1.0, 1.0, 1.0, 0.5, 0.5, 0.5) * size;
+            let root = Matrix6::from_diagonal(&scale) * root;
+            let independent = (root * root.transpose()).try_inverse().unwrap();
+            let information = PoseInformation {
+                independent: (independent + independent.transpose()) * 0.5,
+                gap: 0.01 * 100.0_f64.powf(random.uniform()),
+            };
+            drawn_trial(information, &truth, &mut random)
+        })
+        .collect();
+
+    let noise = fitted_noise(&trials, unit_m).unwrap();
+    for (name, found, drawn) in [
+        ("translation", noise.translation_m, truth.translation_m),
+        ("rotation", noise.rotation_rad, truth.rotation_rad),
+        ("design effect", noise.design_effect, truth.design_effect),
+        ("gap scale", noise.gap_scale, truth.gap_scale),
+    ] {
+        near(name, found / drawn, 1.0, 0.3);
+    }
+
+    let lengths: Vec<f64> = trials
+        .iter()
+        .map(|trial| squared_length_of(trial, &noise).unwrap())
+        .collect();
+    let coverage = coverage(&lengths);
+    near("within 68 %", coverage.within_68, 0.759, 0.04);
+    near("within 95 %", coverage.within_95, 0.905, 0.03);
+
+    assert_eq!(fitted_noise(&trials[..29], unit_m), None);
+}
