@@ -162,16 +162,3 @@ pub fn camera_path(count: usize) -> Vec<Pose> {
     };
     (0..count).map(pose).collect()
 }
-
-/// Features that are similar for nearby poses, shape (n, 7).
-pub fn place_features(poses: &[Pose]) -> Array2<f32> {
-    Array2::from_shape_fn((poses.len(), 7), |(row, column)| {
-        let position = poses[row].translation.vector;
-        let forward = poses[row].rotation * Vector3::z();
-        match column {
-            0 => 1.0,
-            1..=3 => 0.5 * position[column - 1] as f32,
-            _ => forward[column - 4] as f32,
-        }
-    })
-}

@@ -6,14 +6,12 @@ use nalgebra::{Matrix6, Point3, Vector3, Vector6};
 use seese3_core::geometry::{CameraIntrinsics, Pose, PoseError, log};
 use seese3_core::keypoints::Keypoints;
 use seese3_core::statistics::coverage;
-use seese3_robot::localization::{KeypointQuery, KeypointRoom, LocatedView, NotLocated};
+use seese3_robot::localization::{KeypointRoom, LocatedView, NotLocated};
 use seese3_robot::matched_views::{
     Error, KeypointMap, MapNoise, Mapping, MappingParameters, PoseInformation, Trial,
-    TrialRecording, fitted_noise, squared_length as squared_length_of,
+    TrialRecording, ViewKeypoints, fitted_noise, squared_length as squared_length_of,
 };
-use seese3_testing::keypoint_scene::{
-    Random, Scene, SceneView, camera_path, distorted_camera, place_features,
-};
+use seese3_testing::keypoint_scene::{Random, Scene, SceneView, camera_path, distorted_camera};
 use seese3_testing::near;
 
 /// Number of mapped frames of most tests.
@@ -69,8 +67,7 @@ impl World {
     }
 
     fn room_of(&self, stated: &[Pose], map: KeypointMap) -> KeypointRoom {
-        let features = place_features(&self.poses);
-        KeypointRoom::new(stated.to_vec(), features.view(), Arc::new(map))
+        KeypointRoom::new(stated.to_vec(), Arc::new(map))
     }
 }
 
@@ -83,19 +80,13 @@ fn new_poses(count: usize) -> Vec<Pose> {
         .collect()
 }
 
-/// Locates the keypoints of a view that has the features of `pose`.
+/// Locates the keypoints of a view.
 fn located(
     room: &KeypointRoom,
     keypoints: &Keypoints,
-    pose: &Pose,
     camera: &CameraIntrinsics,
 ) -> Result<LocatedView, NotLocated> {
-    let features = place_features(&[*pose]);
-    room.locate(KeypointQuery {
-        feature: features.row(0),
-        keypoints,
-        camera,
-    })
+    room.locate(ViewKeypoints { keypoints, camera })
 }
 
 /// Squared Mahalanobis length of the error of a located view.
@@ -164,7 +155,7 @@ fn a_view_with_exact_keypoints_is_located_within_a_millimeter() {
     let mut random = Random::new(5);
     for pose in new_poses(15) {
         let view = world.scene.view(&pose, &world.camera, 0.0, &mut random);
-        let found = located(&room, &view.keypoints, &pose, &world.camera).unwrap();
+        let found = located(&room, &view.keypoints, &world.camera).unwrap();
         let error = PoseError::between(&pose, &found.pose.pose);
         assert!(
             error.translation_m < 1e-3 && error.rotation_rad < 1e-3,
@@ -173,8 +164,7 @@ fn a_view_with_exact_keypoints_is_located_within_a_millimeter() {
 
         let again = room
             .locate_near(
-                KeypointQuery {
-                    feature: place_features(&[pose]).row(0),
+                ViewKeypoints {
                     keypoints: &view.keypoints,
                     camera: &world.camera,
                 },
@@ -197,11 +187,9 @@ fn errors_under_pixel_noise_agree_with_the_covariance() {
     let world = World::new(Scene::in_box(POINTS, 1), camera_path(80), 0.5);
     let mut map = world.map(&world.poses, world.camera);
     let keypoints = world.keypoints();
-    let features = place_features(&world.poses);
     map.measure_noise(TrialRecording {
         poses: &world.poses,
         keypoints: &keypoints,
-        features: features.view(),
         camera: world.camera,
     });
     let room = world.room_of(&world.poses, map);
@@ -217,7 +205,7 @@ fn errors_under_pixel_noise_agree_with_the_covariance() {
             } else {
                 view.keypoints.clone()
             };
-            let found = located(&room, &keypoints, &pose, &world.camera).unwrap();
+            let found = located(&room, &keypoints, &world.camera).unwrap();
             worst = worst.max(PoseError::between(&pose, &found.pose.pose).translation_m);
             lengths.push(squared_length(&found, &pose));
         }
@@ -235,7 +223,7 @@ fn result_of(world: &World, room: &KeypointRoom, pose: &Pose) -> Result<LocatedV
     let view = world
         .scene
         .view(pose, &world.camera, 0.0, &mut Random::new(8));
-    located(room, &view.keypoints, pose, &world.camera)
+    located(room, &view.keypoints, &world.camera)
 }
 
 /// Fails unless the view is refused as not in the map.
@@ -260,7 +248,7 @@ fn without_keypoints_there_is_neither_a_map_nor_a_pose() {
     }
 
     let world = World::exact();
-    let refused = located(&world.room(), &none, &world.poses[0], &camera);
+    let refused = located(&world.room(), &none, &camera);
     assert_eq!(refused.unwrap_err(), NotLocated::NoKeypoints);
 }
 
@@ -392,7 +380,7 @@ fn a_view_of_another_scene_is_refused() {
     for scene in [other, shuffled] {
         for pose in new_poses(8) {
             let view = scene.view(&pose, &world.camera, 0.0, &mut Random::new(8));
-            assert_not_in_map(located(&room, &view.keypoints, &pose, &world.camera));
+            assert_not_in_map(located(&room, &view.keypoints, &world.camera));
         }
     }
 }
@@ -404,11 +392,9 @@ fn assert_no_confident_wrong_pose(world: &World, cameras: [CameraIntrinsics; 2])
     let [of_map, of_view] = cameras;
     let mut map = world.map(&world.poses, of_map);
     let keypoints = world.keypoints();
-    let features = place_features(&world.poses);
     map.measure_noise(TrialRecording {
         poses: &world.poses,
         keypoints: &keypoints,
-        features: features.view(),
         camera: of_map,
     });
 
@@ -417,7 +403,7 @@ fn assert_no_confident_wrong_pose(world: &World, cameras: [CameraIntrinsics; 2])
         let view = world
             .scene
             .view(&pose, &world.camera, 0.5, &mut Random::new(8));
-        if let Ok(found) = located(&room, &view.keypoints, &pose, &of_view) {
+        if let Ok(found) = located(&room, &view.keypoints, &of_view) {
             let error = PoseError::between(&pose, &found.pose.pose).translation_m;
             let length = squared_length(&found, &pose).sqrt();
             assert!(
