@@ -97,3 +97,42 @@ impl Keypoints {
         &self.descriptors[place * width..(place + 1) * width]
     }
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a failed step is a failed test")]
+mod tests {
+    use super::*;
+
+    /// Oracle: the definition, worked by hand. ±0.5 is ±127, larger numbers are clamped, and the best
+    /// score comes first.
+    #[test]
+    fn keypoints_are_sorted_and_quantized() {
+        let points = [[0.1, 0.2].into(), [0.3, 0.4].into(), [0.5, 0.6].into()];
+        let descriptors = ndarray::arr2(&[[0.5, 0.0], [-1.0, 0.25], [0.003, -0.5]]);
+        let keypoints = Keypoints::new(&points, &[0.2, 0.9, 0.5], descriptors.view());
+
+        assert_eq!(keypoints.points(), [points[1], points[2], points[0]]);
+        assert_eq!(keypoints.scores(), [0.9, 0.5, 0.2]);
+        assert_eq!(keypoints.descriptor(0), [-127, 64]);
+        assert_eq!(keypoints.descriptor(1), [1, -127]);
+        assert_eq!(keypoints.descriptor(2), [127, 0]);
+        assert_eq!(keypoints.descriptor_width(), 2);
+    }
+
+    /// Oracle: the limit.
+    #[test]
+    fn only_the_best_keypoints_are_kept() {
+        let count = MAX_KEYPOINTS + 10;
+        let points = vec![Vector2::zeros(); count];
+        let scores: Vec<f32> = (0..count).map(|place| place as f32).collect();
+        let descriptors = ndarray::Array2::zeros((count, 4));
+        let keypoints = Keypoints::new(&points, &scores, descriptors.view());
+        assert_eq!(keypoints.len(), MAX_KEYPOINTS);
+        assert_eq!(keypoints.scores()[0], (count - 1) as f32);
+        assert_eq!(*keypoints.scores().last().unwrap(), 10.0);
+
+        let none = Keypoints::new(&[], &[], ndarray::Array2::zeros((0, 4)).view());
+        assert_eq!(none, Keypoints::default());
+        assert_eq!((none.len(), none.descriptor_width()), (0, 0));
+    }
+}

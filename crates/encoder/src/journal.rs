@@ -184,6 +184,27 @@ mod tests {
         }
     }
 
+    /// Oracle: what was appended, with and without keypoints, and with none found.
+    #[test]
+    fn keypoints_come_back_as_they_were() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rows");
+        let descriptors = ndarray::arr2(&[[0.5_f32, -0.5, 0.25], [0.0, 0.1, -0.9]]);
+        let points = [[0.25_f32, 0.75].into(), [f32::MIN_POSITIVE, 1.0].into()];
+        let found = Keypoints::new(&points, &[0.1, 0.7], descriptors.view());
+        let frames =
+            [Some(found), None, Some(Keypoints::default())].map(|keypoints| EncodedFrame {
+                feature: vec![1.0, 2.0],
+                keypoints,
+            });
+
+        let (mut journal, _) = Journal::open(&path, "key").unwrap();
+        journal.append(frames.iter().enumerate()).unwrap();
+        drop(journal);
+        let (_, back) = Journal::open(&path, "key").unwrap();
+        assert_eq!(back, frames.into_iter().enumerate().collect::<Vec<_>>());
+    }
+
     /// Oracle: what was appended, under every cut of the file: whole records survive, a cut one
     /// does not.
     #[test]

@@ -241,3 +241,105 @@ impl CellWeights {
             .sum()
     }
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a failed step is a failed test")]
+mod tests {
+    use ndarray::ArrayD;
+    use seese3_testing::{golden, json, near, npy, number};
+
+    use super::*;
+
+    fn outputs() -> [ArrayD<f32>; 3] {
+        ["positions", "reliability", "descriptors"]
+            .map(|name| npy(&golden().join(format!("keypoints/{name}.npy"))))
+    }
+
+    fn detected(outputs: &[ArrayD<f32>; 3]) -> Result<Keypoints, String> {
+        let [positions, reliability, descriptors] = outputs.each_ref().map(|map| map.view());
+        Ok(KeypointMaps::new(positions, reliability, descriptors)?.detect())
+    }
+
+    /// Oracle: the definition in NumPy and SciPy (`tests/golden/keypoints`). A descriptor has 8 bits
+    /// with steps of 1/254, and numbers beyond ±0.5 are clamped.
+    #[test]
+    fn keypoints_are_those_of_the_definition() {
+        let found = detected(&outputs()).unwrap();
+        let expected = json(&golden().join("keypoints/expected.json"));
+        let rows = |name: &str| expected[name].as_array().unwrap();
+        assert_eq!(found.len(), rows("scores").len());
+
+        for (place, point) in found.points().iter().enumerate() {
+            let expected = &rows("points")[place];
+            near("x", f64::from(point.x) * 64.0, number(&expected[0]), 1e-3);
+            near("y", f64::from(point.y) * 48.0, number(&expected[1]), 1e-3);
+
+            let score = f64::from(found.scores()[place]);
+            near("score", score, number(&rows("scores")[place]), 1e-6);
+
+            let numbers = rows("descriptors")[place].as_array().unwrap();
+            for (&value, expected) in found.descriptor(place).iter().zip(numbers) {
+                let expected = number(expected).clamp(-0.5, 0.5);
+                near(
+                    "descriptor",
+                    f64::from(value) / 254.0,
+                    expected,
+                    0.501 / 254.0,
+                );
+            }
+        }
+    }
+
+    /// Oracle: the definition. A keypoint needs a probability above 0.02, so none is found where all
+    /// pixels are less probable, where the probabilities are not numbers, or in too small a map.
+    #[test]
+    fn blank_and_broken_outputs_give_no_keypoints() {
+        for value in [0.0, 1.0 / 65.0, f32::NAN] {
+            let mut outputs = outputs();
+            outputs[0].fill(value);
+            assert!(detected(&outputs).unwrap().is_empty(), "{value}");
+        }
+
+        // One probable pixel is one keypoint at its center.
+        let mut one = outputs();
+        one[0].fill(1e-3);
+        one[0][[8 * 3 + 5, 2, 4]] = 0.5;
+        let found = detected(&one).unwrap();
+        assert_eq!(found.len(), 1);
+        near("x", f64::from(found.points()[0].x), 37.5 / 64.0, 1e-6);
+        near("y", f64::from(found.points()[0].y), 19.5 / 48.0, 1e-6);
+
+        // Descriptors of length 0 stay finite.
+        one[2].fill(0.0);
+        assert!(
+            detected(&one)
+                .unwrap()
+                .descriptor(0)
+                .iter()
+                .all(|&x| x == 0)
+        );
+    }
+
+    /// Oracle: the shapes that the module states.
+    #[test]
+    fn outputs_of_other_shapes_are_refused() {
+        let wrong = |change: &dyn Fn(&mut [ArrayD<f32>; 3])| {
+            let mut outputs = outputs();
+            change(&mut outputs);
+            let message = detected(&outputs).unwrap_err();
+            assert!(
+                message.contains("expected positions (65, h, w)"),
+                "{message}"
+            );
+        };
+        wrong(&|[positions, ..]| *positions = ArrayD::zeros(vec![64, 6, 8]));
+        wrong(&|[positions, ..]| *positions = ArrayD::zeros(vec![65, 6, 7]));
+        wrong(&|[positions, ..]| *positions = ArrayD::zeros(vec![65, 48]));
+        wrong(&|[_, reliability, _]| *reliability = ArrayD::zeros(vec![2, 6, 8]));
+        wrong(&|[.., descriptors]| *descriptors = ArrayD::zeros(vec![0, 6, 8]));
+        wrong(&|[.., descriptors]| *descriptors = ArrayD::zeros(vec![8, 8, 6]));
+        wrong(&|outputs| {
+            *outputs = [65, 1, 8].map(|channels| ArrayD::zeros(vec![channels, 1, 1]));
+        });
+    }
+}

@@ -11,7 +11,7 @@ use seese3_encoder::{
     Bounds, Encoder, Error, Filter, Layer, ModelTask, Preparation, Resize, Runtime, RuntimeKind,
     decode, normalised, read_image, recipe,
 };
-use seese3_testing::{Tensors, golden, npy, shared};
+use seese3_testing::{Tensors, golden, json, npy, number, shared};
 
 /// The runtimes that this build has and this machine can run; at least one, or the tests that loop
 /// over them would assert nothing.
@@ -619,6 +619,48 @@ fn the_kitchens_photographs_give_its_features() {
             let encoder = Encoder::model(task, &runtime).unwrap();
             agree(&encoder, &format!("features_{model}_{file}.npy"), bound);
         }
+    }
+}
+
+/// Oracle: the detector's definition in NumPy on onnxruntime's outputs, of Pillow's image
+/// (`tests/golden/keypoints`). Decoder and resize filter differ by some levels of a pixel, so that a
+/// few weak keypoints differ.
+#[test]
+#[ignore = "needs the folder of large inputs: SEESE3_SHARED or ../shared"]
+fn the_keypoints_of_an_image_are_those_of_numpy() {
+    let expected = json(&golden().join("keypoints/image.json"));
+    let numbers = |name: &str| expected[name].as_array().unwrap();
+    let inputs = shared().join("models/inputs");
+    let recipe = recipe("xfeat-keypoints").unwrap();
+
+    for runtime in runtimes() {
+        let task = ModelTask {
+            keypoints: recipe.keypoints.clone(),
+            ..real_model(
+                "xfeat_keypoints_320x240",
+                &recipe.preparation,
+                vec![layer("block4", "grid2x2")],
+            )
+        };
+        let encoder = Encoder::model(task, &runtime).unwrap();
+        let image = read_image(&inputs, expected["image"].as_str().unwrap()).unwrap();
+        let image = encoder.prepare(image).unwrap();
+        let frames = encoder.encode_frames(&[vec![&image]]).unwrap();
+        let keypoints = frames[0].keypoints.as_ref().unwrap();
+        assert_eq!(keypoints.len(), numbers("scores").len());
+
+        let mut found = 0;
+        for (point, score) in numbers("points").iter().zip(numbers("scores")).take(200) {
+            let [x, y] = [0, 1].map(|axis| number(&point[axis]));
+            let is_it = |place: usize| {
+                let point = keypoints.points()[place];
+                let off = (f64::from(point.x) * 320.0 - x).hypot(f64::from(point.y) * 240.0 - y);
+                let ratio = f64::from(keypoints.scores()[place]) / number(score);
+                off < 0.25 && (0.7..1.4).contains(&ratio)
+            };
+            found += usize::from((0..keypoints.len()).any(is_it));
+        }
+        assert!(found >= 195, "{found} of the 200 best keypoints");
     }
 }
 
