@@ -257,3 +257,176 @@ impl Columns {
         frames
     }
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a failed step is a failed test")]
+mod tests {
+    use super::*;
+
+    /// Tensors of two frames with one and two keypoints.
+    #[derive(Clone)]
+    struct Parts {
+        counts: Vec<i64>,
+        positions: Vec<[u16; 2]>,
+        inverse_depths: Vec<u16>,
+        deviations: Vec<u8>,
+        descriptors: Vec<i8>,
+        mean: Vec<f32>,
+        axes: Vec<f32>,
+    }
+
+    fn parts() -> Parts {
+        Parts {
+            counts: vec![1, 2],
+            positions: vec![[1, 2], [3, 4], [5, 6]],
+            inverse_depths: vec![10, 20, 30],
+            deviations: vec![7, 8, 9],
+            descriptors: vec![1; 3 * COMPRESSED],
+            mean: vec![0.5; 4],
+            axes: vec![0.1; 4 * COMPRESSED],
+        }
+    }
+
+    impl Parts {
+        fn file(self) -> Vec<u8> {
+            let mut tensors = TensorWriter::default();
+            let count = self.positions.len();
+            tensors.i64("counts", &[self.counts.len()], self.counts.into_iter());
+            tensors.u16(
+                "positions",
+                &[count, 2],
+                self.positions.into_iter().flatten(),
+            );
+            let [depths, deviations] = [self.inverse_depths.len(), self.deviations.len()];
+            tensors.u16("inverse_depths", &[depths], self.inverse_depths.into_iter());
+            tensors.u8("deviations", &[deviations], self.deviations.into_iter());
+            let rows = self.descriptors.len() / COMPRESSED;
+            tensors.i8(
+                "descriptors",
+                &[rows, COMPRESSED],
+                self.descriptors.into_iter(),
+            );
+            tensors.f32("basis.mean", &[self.mean.len()], self.mean.into_iter());
+            let rows = self.axes.len() / COMPRESSED;
+            tensors.f32("basis.axes", &[rows, COMPRESSED], self.axes.into_iter());
+            tensors.finish("keypoints").unwrap()
+        }
+    }
+
+    fn entry() -> KeypointsEntry {
+        serde_json::from_value(serde_json::json!({
+            "source": {
+                "feature": seese3_core::features::FeatureSource::imported("f", 0),
+                "positions": "a", "reliability": "b", "descriptors": "c", "model_file": "m.onnx",
+            },
+            "camera": {
+                "focal": [1.0, 1.0], "height": 0.75, "center": [0.5, 0.375],
+                "distortion": { "model": "none" },
+            },
+            "unit_m": 2.0, "epipolar_px": 0.5,
+            "noise": {
+                "translation_m": 0.1, "rotation_rad": 0.1, "design_effect": 2.0, "gap_scale": 0.1,
+            },
+            "object": { "file": "keypoints-0.safetensors", "sha256": "", "bytes": 0 },
+        }))
+        .unwrap()
+    }
+
+    #[track_caller]
+    fn refused(result: Result<RoomKeypoints, Error>, word: &str) {
+        let error = result.unwrap_err();
+        assert!(matches!(error, Error::Damaged { .. }), "{error}");
+        let message = error.to_string();
+        let cause = std::error::Error::source(&error).map(ToString::to_string);
+        let text = format!("{message}: {}", cause.unwrap_or_default());
+        assert!(
+            text.contains("k.safetensors") && text.contains(word),
+            "{text}"
+        );
+    }
+
+    /// Oracle: the format, worked by hand. 65535 positions span the image, an inverse depth has
+    /// 65535 / 16 steps in an inverse unit of 2 m, a deviation steps of 0.001.
+    #[test]
+    fn tensors_are_read_by_the_format() {
+        let read = read_keypoints("k.safetensors", &parts().file(), entry(), 2).unwrap();
+        let [first, second] = read.map.frames.as_slice() else {
+            panic!("two frames")
+        };
+        assert_eq!([first.len(), second.len()], [1, 2]);
+        assert_eq!(first.points[0], Vector2::new(1.0, 2.0) / 65_535.0);
+        assert_eq!(second.points[1], Vector2::new(5.0, 6.0) / 65_535.0);
+        let expected = 30.0 * 16.0 / 65_535.0 / 2.0;
+        assert!((f64::from(second.inverse_depths[1]) - expected).abs() < 1e-9);
+        assert!((second.deviations[1] - 0.009).abs() < 1e-7);
+    }
+
+    /// Oracle: the definition of the tensors; each case contradicts it in one place.
+    #[test]
+    fn tensors_that_contradict_each_other_are_refused() {
+        let changed = |change: &dyn Fn(&mut Parts)| {
+            let mut parts = parts();
+            change(&mut parts);
+            read_keypoints("k.safetensors", &parts.file(), entry(), 2)
+        };
+        let word = "contradict";
+        refused(changed(&|parts| parts.counts = vec![1, 3]), word);
+        refused(changed(&|parts| parts.counts = vec![4, -1]), word);
+        refused(
+            changed(&|parts| parts.counts = vec![i64::MAX, i64::MAX]),
+            word,
+        );
+        refused(changed(&|parts| parts.counts = vec![3]), word);
+        refused(changed(&|parts| parts.counts = vec![1, 2, 0]), word);
+        refused(changed(&|parts| parts.positions.truncate(2)), word);
+        refused(changed(&|parts| parts.inverse_depths.push(1)), word);
+        refused(changed(&|parts| parts.deviations.truncate(1)), word);
+        refused(
+            changed(&|parts| parts.descriptors.truncate(COMPRESSED)),
+            word,
+        );
+
+        let word = "basis";
+        refused(changed(&|parts| parts.mean.push(1.0)), word);
+        refused(changed(&|parts| parts.mean[0] = f32::NAN), word);
+        refused(changed(&|parts| parts.axes[0] = f32::INFINITY), word);
+        refused(
+            changed(&|parts| (parts.mean, parts.axes) = (vec![], vec![])),
+            word,
+        );
+    }
+
+    /// Oracle: the definition. A unit or a noise of 0 or less gives depths and covariances that are
+    /// not finite.
+    #[test]
+    fn numbers_of_the_manifest_that_are_not_positive_are_refused() {
+        let file = parts().file();
+        for bad in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+            for change in [
+                (|entry, bad| entry.unit_m = bad) as fn(&mut KeypointsEntry, f64),
+                |entry, bad| entry.epipolar_px = bad,
+                |entry, bad| entry.noise.translation_m = bad,
+                |entry, bad| entry.noise.rotation_rad = bad,
+                |entry, bad| entry.noise.design_effect = bad,
+                |entry, bad| entry.noise.gap_scale = bad,
+            ] {
+                let mut entry = entry();
+                change(&mut entry, bad);
+                refused(read_keypoints("k.safetensors", &file, entry, 2), "above 0");
+            }
+        }
+    }
+
+    /// Oracle: the format of the file; a tensor that is absent is named.
+    #[test]
+    fn a_file_without_a_tensor_is_refused_by_its_name() {
+        let mut tensors = TensorWriter::default();
+        tensors.i64("counts", &[2], [0, 0].into_iter());
+        let file = tensors.finish("keypoints").unwrap();
+        refused(
+            read_keypoints("k.safetensors", &file, entry(), 2),
+            "'positions'",
+        );
+        refused(read_keypoints("k.safetensors", b"nonsense", entry(), 2), "");
+    }
+}

@@ -9,6 +9,7 @@
 
 mod dying;
 mod extension;
+mod room_keypoints;
 mod store;
 mod store_care;
 

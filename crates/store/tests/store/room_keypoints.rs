@@ -1,0 +1,281 @@
+//! Keypoints of stored rooms.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use ndarray::{Array1, Array2};
+use seese3_core::features::Features;
+use seese3_core::keypoints::KeypointSource;
+use seese3_core::room::{Frames, Provenance, Room, RoomId};
+use seese3_robot::matched_views::{
+    COMPRESSED, DescriptorBasis, KeypointMap, MapNoise, MappedKeypoints,
+};
+use seese3_store::{Error, OtherFeatures, RoomContents, RoomKeypoints, Store};
+
+use crate::store::{files, stored};
+use seese3_testing::keypoint_scene::{Random, distorted_camera};
+use seese3_testing::near;
+use seese3_testing::recording::{room, set};
+
+/// Number of frames of `room("a")`.
+const FRAMES: usize = 300;
+/// Median depth, meters.
+const UNIT_M: f64 = 2.5;
+
+/// Keypoints of random numbers within their ranges: `count` in each frame but every fifth.
+fn keypoints(frame_count: usize, count: usize) -> RoomKeypoints {
+    let mut random = Random::new(4);
+    let frames = (0..frame_count)
+        .map(|row| {
+            let count = if row % 5 == 4 { 0 } else { count };
+            let mut frame = MappedKeypoints::default();
+            for _ in 0..count {
+                let point = [random.uniform() as f32, random.uniform() as f32];
+                frame.points.push(point.into());
+                frame
+                    .inverse_depths
+                    .push((random.between(0.02, 8.0) / UNIT_M) as f32);
+                frame.deviations.push(random.between(0.002, 0.2) as f32);
+                let byte = |_| random.between(-127.0, 128.0).floor() as i8;
+                frame.descriptors.extend((0..COMPRESSED).map(byte));
+            }
+            frame
+        })
+        .collect();
+
+    let mean = Array1::from_shape_fn(64, |_| random.normal() as f32);
+    let axes = Array2::from_shape_fn((64, COMPRESSED), |_| random.normal() as f32);
+    let map = KeypointMap {
+        camera: distorted_camera(),
+        unit_m: UNIT_M,
+        epipolar_px: 0.7,
+        noise: MapNoise {
+            translation_m: 0.003,
+            rotation_rad: 0.001,
+            design_effect: 12.0,
+            gap_scale: 0.3,
+        },
+        basis: DescriptorBasis::from_parts(mean, axes).unwrap(),
+        frames,
+    };
+    let source = KeypointSource {
+        feature: set("f", 1.0).source().clone(),
+        positions: "kpt".to_owned(),
+        reliability: "heat".to_owned(),
+        descriptors: "fusion".to_owned(),
+        model_file: "/models/a.onnx".to_owned(),
+    };
+    RoomKeypoints {
+        source,
+        map: Arc::new(map),
+    }
+}
+
+/// A store with `room("a")`, the features "f" and these keypoints.
+async fn begun(keypoints: &RoomKeypoints) -> (tempfile::TempDir, Store) {
+    let (folder, store) = stored().await;
+    store
+        .publish_contents(RoomContents {
+            room: &room("a"),
+            features: &[set("f", 1.0)],
+            keypoints: Some(keypoints),
+        })
+        .await
+        .unwrap();
+    (folder, store)
+}
+
+/// Frames of `room("a")` with their poses, times and names.
+fn part(rows: std::ops::Range<usize>) -> Room {
+    let frames = Frames {
+        numbers: Vec::new(),
+        images: Vec::new(),
+        sequences: Vec::new(),
+        held_out: Vec::new(),
+        ..room("a").frames().select(&rows.collect::<Vec<_>>())
+    };
+    Room::new(RoomId::new("a").unwrap(), frames, Provenance::default()).unwrap()
+}
+
+fn features(name: &str, rows: std::ops::Range<usize>) -> Features {
+    set(name, 1.0).select(&rows.collect::<Vec<_>>())
+}
+
+/// Oracle: what was published, within half a step of each number: 1/65535 of the image, 16/65535 of an
+/// inverse unit, 0.001 of a deviation. Everything else is exact.
+#[tokio::test]
+async fn keypoints_come_back_within_half_a_step() {
+    let sent = keypoints(FRAMES, 20);
+    let (_folder, store) = begun(&sent).await;
+    let back = store.load_room("a", None).await.unwrap();
+    let back = back.keypoints.unwrap();
+    assert_eq!(back.source, sent.source);
+
+    let [found, expected] = [&back.map, &sent.map];
+    assert_eq!(found.camera, expected.camera);
+    assert_eq!(found.noise, expected.noise);
+    assert_eq!(found.basis, expected.basis);
+    assert_eq!([found.unit_m, found.epipolar_px], [UNIT_M, 0.7]);
+    assert_eq!(found.frames.len(), FRAMES);
+    for (found, expected) in found.frames.iter().zip(&expected.frames) {
+        assert_eq!(found.descriptors, expected.descriptors);
+        assert_eq!(found.len(), expected.len());
+        for place in 0..found.len() {
+            let step = 0.501 / 65_535.0;
+            for axis in 0..2 {
+                let [a, b] = [found, expected].map(|frame| f64::from(frame.points[place][axis]));
+                near("position", a, b, step);
+            }
+            let [a, b] = [found, expected].map(|frame| f64::from(frame.inverse_depths[place]));
+            near("inverse depth", a, b, 16.0 * step / UNIT_M);
+            let [a, b] = [found, expected].map(|frame| f64::from(frame.deviations[place]));
+            near("deviation", a, b, 0.000_501);
+        }
+    }
+}
+
+/// Oracle: numbers that do not fit are stored as the nearest that does, so that depths stay finite.
+#[tokio::test]
+async fn numbers_out_of_range_are_clamped() {
+    let mut sent = keypoints(FRAMES, 4);
+    let map = Arc::make_mut(&mut sent.map);
+    map.frames[0].points[0] = [-0.25, 1.5].into();
+    map.frames[0].inverse_depths = vec![0.0, 1e-9, 1e9, -1.0];
+    map.frames[0].deviations = vec![0.0, 1e-9, 1e9, 0.255];
+    let (_folder, store) = begun(&sent).await;
+
+    let back = store.load_room("a", None).await.unwrap().keypoints.unwrap();
+    let frame = &back.map.frames[0];
+    assert_eq!(frame.points[0], nalgebra::Vector2::new(0.0, 1.0));
+    let [least, most] = [16.0 / 65_535.0 / UNIT_M, 16.0 / UNIT_M];
+    for (&found, expected) in frame.inverse_depths.iter().zip([least, least, most, least]) {
+        near("inverse depth", f64::from(found), expected, 1e-6);
+    }
+    for (&found, expected) in frame.deviations.iter().zip([0.001, 0.001, 0.255, 0.255]) {
+        near("deviation", f64::from(found), expected, 1e-6);
+    }
+}
+
+/// Oracle: the documented size.
+#[tokio::test]
+async fn three_hundred_keypoints_take_at_most_12000_bytes() {
+    let sizes = |folder: &Path| -> Vec<u64> {
+        let files = files(folder, "keypoints-");
+        files
+            .iter()
+            .map(|file| file.metadata().unwrap().len())
+            .collect()
+    };
+    let few = begun(&keypoints(FRAMES, 0)).await;
+    let many = begun(&keypoints(FRAMES, 300)).await;
+    let [few, many] = [&few, &many].map(|(folder, _)| sizes(folder.path()));
+    assert_eq!([few.len(), many.len()], [1, 1]);
+
+    let frames = (FRAMES * 4 / 5) as u64;
+    let each = (many[0] - few[0]) / frames;
+    assert!((11_000..12_000).contains(&each), "{each} bytes a frame");
+}
+
+/// Oracle: the promises of publishing. The same frames keep their keypoints, other frames have none
+/// of them, and keypoints of another number of frames are refused.
+#[tokio::test]
+async fn the_same_frames_keep_their_keypoints() {
+    let sent = keypoints(FRAMES, 5);
+    let (_folder, store) = begun(&sent).await;
+    let known = store.load_room("a", None).await.unwrap().keypoints.unwrap();
+
+    let again = store
+        .publish_room(&room("a"), &[set("g", 2.0)])
+        .await
+        .unwrap();
+    assert_eq!((again.revision, again.is_new), (2, true));
+    let back = store.load_room("a", None).await.unwrap();
+    assert_eq!(back.features.len(), 2);
+    assert_eq!(back.keypoints.unwrap().map.frames, known.map.frames);
+
+    let others = store
+        .publish_room(&part(0..200), &[features("f", 0..200)])
+        .await;
+    assert_eq!(others.unwrap().revision, 3);
+    let back = store.load_room("a", None).await.unwrap();
+    assert!(back.keypoints.is_none());
+    assert_eq!(back.room.frame_count(), 200);
+
+    let refused = store
+        .publish_contents(RoomContents {
+            room: &room("b"),
+            features: &[set("f", 1.0)],
+            keypoints: Some(&keypoints(FRAMES - 1, 5)),
+        })
+        .await;
+    let message = refused.unwrap_err().to_string();
+    assert!(
+        message.contains("299") && message.contains("300"),
+        "{message}"
+    );
+    assert!(store.verify(&|_| ()).await.unwrap().is_empty());
+}
+
+/// Oracle: the promise of an extension. Known frames keep their keypoints, added frames have none;
+/// without features of the same encoder pass, the keypoints are left behind.
+#[tokio::test]
+async fn added_frames_have_no_keypoints() {
+    for others in [OtherFeatures::Required, OtherFeatures::LeftBehind] {
+        let (_folder, store) = stored().await;
+        let whole: Vec<usize> = (0..260).collect();
+        let known = room("a").frames().select(&whole);
+        let known = Room::new(RoomId::new("a").unwrap(), known, Provenance::default()).unwrap();
+        let sent = keypoints(260, 5);
+        store
+            .publish_contents(RoomContents {
+                room: &known,
+                features: &[features("f", 0..260), features("g", 0..260)],
+                keypoints: Some(&sent),
+            })
+            .await
+            .unwrap();
+        let before = store.load_room("a", None).await.unwrap().keypoints.unwrap();
+
+        let added = if others == OtherFeatures::Required {
+            vec![features("f", 260..300), features("g", 260..300)]
+        } else {
+            vec![features("g", 260..300)]
+        };
+        store
+            .extend_room(&part(260..300), &added, others)
+            .await
+            .unwrap();
+        let back = store.load_room("a", None).await.unwrap();
+        assert_eq!(back.room.frame_count(), 300);
+        if others == OtherFeatures::Required {
+            let map = back.keypoints.unwrap().map;
+            assert_eq!(map.frames[..260], before.map.frames);
+            assert!(map.frames[260..].iter().all(|frame| frame.is_empty()));
+        } else {
+            assert!(back.keypoints.is_none());
+        }
+        assert!(store.verify(&|_| ()).await.unwrap().is_empty());
+    }
+}
+
+/// Oracle: the checksum of the file's manifest.
+#[tokio::test]
+async fn a_damaged_file_of_keypoints_is_found() {
+    let (folder, store) = begun(&keypoints(FRAMES, 5)).await;
+    let file = files(folder.path(), "keypoints-").remove(0);
+    let mut bytes = std::fs::read(&file).unwrap();
+    let last = bytes.len() - 1;
+    bytes[last] ^= 1;
+    std::fs::write(&file, &bytes).unwrap();
+
+    let name = file.file_name().unwrap().to_str().unwrap();
+    let findings = store.verify(&|_| ()).await.unwrap();
+    assert_eq!(findings.len(), 1);
+    assert!(
+        findings[0].problem.contains(name),
+        "{}",
+        findings[0].problem
+    );
+    let refused = store.load_room("a", None).await.unwrap_err();
+    assert!(matches!(refused, Error::Damaged { .. }), "{refused}");
+}
