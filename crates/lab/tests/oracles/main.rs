@@ -10,5 +10,6 @@
 mod camera_fit;
 mod formulations;
 mod kitchen;
+mod matched_localization;
 mod planning;
 mod probes;
