@@ -150,6 +150,16 @@ fn features_to_keep(newest: &RoomBody, published: &[FeaturesEntry]) -> Vec<Featu
         .collect()
 }
 
+/// The keypoints of the newest revision, unless other features replace those of the same encoder
+/// pass, by which similar frames are retrieved.
+fn keypoints_to_keep(newest: &RoomBody, features: &[FeaturesEntry]) -> Option<KeypointsEntry> {
+    let known = newest.keypoints.clone()?;
+    let is_replaced = features.iter().any(|entry| {
+        entry.source.name == known.source.feature.name && entry.source != known.source.feature
+    });
+    (!is_replaced).then_some(known)
+}
+
 impl Store {
     /// Publishes a room with features as a new revision.
     ///
@@ -262,7 +272,8 @@ impl Store {
                 if newest.frames == body.frames || self.has_poses(&folder, newest, room).await? {
                     let kept = features_to_keep(newest, &objects.features);
                     body.features.extend(kept);
-                    body.keypoints = body.keypoints.or(newest.keypoints.clone());
+                    let kept = keypoints_to_keep(newest, &body.features);
+                    body.keypoints = body.keypoints.or(kept);
                 } else if over == PublishPolicy::SameFrames {
                     return Err(Error::OtherFrames {
                         room: room.id().to_string(),

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use ndarray::{Array1, Array2};
-use seese3_core::features::Features;
+use seese3_core::features::{FeatureSource, Features};
 use seese3_core::keypoints::KeypointSource;
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_robot::matched_views::{
@@ -214,6 +214,24 @@ async fn the_same_frames_keep_their_keypoints() {
         "{message}"
     );
     assert!(store.verify(&|_| ()).await.unwrap().is_empty());
+}
+
+/// Oracle: a view is retrieved by features of the keypoints' encoder. Features of another encoder
+/// under the same name cannot be compared with them.
+#[tokio::test]
+async fn features_of_another_encoder_drop_the_keypoints_of_the_former() {
+    let (_folder, store) = begun(&keypoints(FRAMES, 5)).await;
+    let former = set("f", 1.0);
+    let source = FeatureSource {
+        encoder: "another".to_owned(),
+        ..former.source().clone()
+    };
+    let other = Features::new(source, former.rows().to_owned()).unwrap();
+    store.publish_room(&room("a"), &[other]).await.unwrap();
+
+    let back = store.load_room("a", None).await.unwrap();
+    assert_eq!(back.features("f").unwrap().source().encoder, "another");
+    assert!(back.keypoints.is_none());
 }
 
 /// Oracle: the promise of an extension. Known frames keep their keypoints, added frames have none;
