@@ -7,17 +7,24 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use seese3_core::features::Features;
+use seese3_core::keypoints::{KeypointSource, Keypoints};
 use seese3_data::datasets::{self, Reader, Unusable};
 use seese3_encoder::{self as encoder, Bounds};
+use seese3_robot::matched_views::{Mapping, MappingParameters};
 use seese3_server::Keyring;
-use seese3_store::{ResourceName, Store, check_adapter_files, stated_weights_size};
+use seese3_store::{
+    ResourceName, RoomContents, RoomKeypoints, Store, check_adapter_files, stated_weights_size,
+};
 use sha2::{Digest, Sha256};
 
 use seese3_testing::golden;
+use seese3_testing::keypoint_scene::{Random, Scene, camera_path, distorted_camera};
 use seese3_testing::recording::{adapter, room, set};
 
 /// An issuer in a file of credentials.
@@ -320,13 +327,43 @@ fn adapters() {
     assert!(refused > fed / 2, "{refused} of {fed}");
 }
 
+/// Keypoints of the frames of `room("a")`, mapped from views of a scene.
+fn mapped_keypoints(features: &Features) -> RoomKeypoints {
+    let scene = Scene::in_box(40, 1);
+    let camera = distorted_camera();
+    let poses = camera_path(features.rows().nrows());
+    let mut random = Random::new(2);
+    let keypoints: Vec<Keypoints> = poses
+        .iter()
+        .map(|pose| scene.view(pose, &camera, 0.0, &mut random).keypoints)
+        .collect();
+
+    let parameters = MappingParameters::default();
+    let mapping = Mapping::new(&poses, &keypoints, camera, parameters).unwrap();
+    let map = Arc::new(mapping.map(&|| ()));
+    assert!(map.frames.iter().any(|frame| !frame.is_empty()));
+    let source = KeypointSource {
+        feature: features.source().clone(),
+        positions: "kpt".to_owned(),
+        reliability: "heat".to_owned(),
+        descriptors: "fusion".to_owned(),
+        model_file: "a.onnx".to_owned(),
+    };
+    RoomKeypoints { source, map }
+}
+
 #[test]
 fn rooms() {
     let runtime = runtime();
     let (folder, store) = runtime.block_on(stored());
-    runtime
-        .block_on(store.publish_room(&room("a"), &[set("f", 1.0)]))
-        .unwrap();
+    let features = [set("f", 1.0)];
+    let keypoints = mapped_keypoints(&features[0]);
+    let contents = RoomContents {
+        room: &room("a"),
+        features: &features,
+        keypoints: Some(&keypoints),
+    };
+    runtime.block_on(store.publish_contents(contents)).unwrap();
 
     let manifest = folder.path().join("rooms/a/revisions/000001.json");
     let sealed = std::fs::read(&manifest).unwrap();
