@@ -12,6 +12,7 @@ use seese3_core::features::Features;
 use seese3_core::room::FrameId;
 use seese3_core::splits::HoldOut;
 use seese3_core::training::RoomData;
+use seese3_lab::experiments::check_hold_out;
 use seese3_lab::experiments::localization::{LocalizationProtocol, RuleScores, evaluate};
 use seese3_lab::experiments::matched_localization::{self, MappedAndAsked, MatchedLocalization};
 use seese3_lab::report::{
@@ -61,10 +62,10 @@ pub struct Localization {
     #[arg(long, value_parser = one_of::<HoldOut>(), conflicts_with_all = ["map_every", "map_blocks", "adapter", "fit"])]
     hold_out: Option<HoldOut>,
     /// ONNX file of the encoder with keypoints; by default the file that the room was encoded with
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["adapter", "fit"])]
     model: Option<PathBuf>,
     /// Folder of the images; by default that of the import. Rooms of `seese3 studio` are drawn again
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["adapter", "fit"])]
     images: Option<PathBuf>,
     /// Seed of the fitted adapter
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
@@ -80,6 +81,9 @@ impl Localization {
         self.json.begin()?;
         let store = Store::open(&self.store)?;
         if self.adapter.is_none() && !self.fit {
+            if self.features.is_some() {
+                bail!("--features needs --adapter or --fit: matched views use keypoints");
+            }
             return self.evaluate_matched(&store).await;
         }
 
@@ -138,8 +142,8 @@ impl Localization {
         let features = stored.features(&keypoints.source.feature.name);
         let features = features.context("the room's keypoints have no features")?;
 
+        let (mapped, asked) = self.frames(&stored)?;
         let encoded = self.encode(&stored, keypoints)?;
-        let (mapped, asked) = self.frames(&stored);
         let recording = TrialRecording {
             poses: stored.room.poses(),
             keypoints: &encoded.keypoints,
@@ -201,14 +205,17 @@ impl Localization {
     }
 
     /// The mapped frames, and the frames that are asked for.
-    fn frames(&self, stored: &StoredRoom) -> (Vec<FrameId>, Vec<FrameId>) {
+    fn frames(&self, stored: &StoredRoom) -> anyhow::Result<(Vec<FrameId>, Vec<FrameId>)> {
         let timeline = stored.room.timeline();
         match self.hold_out {
-            Some(hold_out) => (hold_out.mapped(timeline), hold_out.tracked(timeline)),
+            Some(hold_out) => {
+                check_hold_out(&stored.room, hold_out)?;
+                Ok((hold_out.mapped(timeline), hold_out.tracked(timeline)))
+            }
             None => {
                 let protocol = self.protocol();
                 let count = timeline.frame_count;
-                (protocol.mapped(count), protocol.asked(count))
+                Ok((protocol.mapped(count), protocol.asked(count)))
             }
         }
     }

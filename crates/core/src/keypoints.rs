@@ -9,8 +9,8 @@ use crate::features::FeatureSource;
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct KeypointSource {
-    /// Source of the features by which similar frames are retrieved; encoder and preprocessing are
-    /// those of the keypoints.
+    /// Source of the features of the same encoder pass; encoder and preprocessing are those of the
+    /// keypoints.
     pub feature: FeatureSource,
     /// The output with the probabilities of keypoints.
     pub positions: String,

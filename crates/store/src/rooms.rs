@@ -150,14 +150,15 @@ fn features_to_keep(newest: &RoomBody, published: &[FeaturesEntry]) -> Vec<Featu
         .collect()
 }
 
-/// The keypoints of the newest revision, unless other features replace those of the same encoder
-/// pass, by which similar frames are retrieved.
-fn keypoints_to_keep(newest: &RoomBody, features: &[FeaturesEntry]) -> Option<KeypointsEntry> {
+/// The keypoints of the newest revision, unless they contradict the next one: the room has another
+/// camera, or features of another encoder replace those of the same encoder pass.
+fn keypoints_to_keep(newest: &RoomBody, next: &RoomBody) -> Option<KeypointsEntry> {
     let known = newest.keypoints.clone()?;
-    let is_replaced = features.iter().any(|entry| {
+    let is_replaced = next.features.iter().any(|entry| {
         entry.source.name == known.source.feature.name && entry.source != known.source.feature
     });
-    (!is_replaced).then_some(known)
+    let is_same_camera = next.provenance.camera == Some(known.camera);
+    (is_same_camera && !is_replaced).then_some(known)
 }
 
 impl Store {
@@ -272,7 +273,7 @@ impl Store {
                 if newest.frames == body.frames || self.has_poses(&folder, newest, room).await? {
                     let kept = features_to_keep(newest, &objects.features);
                     body.features.extend(kept);
-                    let kept = keypoints_to_keep(newest, &body.features);
+                    let kept = keypoints_to_keep(newest, &body);
                     body.keypoints = body.keypoints.or(kept);
                 } else if over == PublishPolicy::SameFrames {
                     return Err(Error::OtherFrames {

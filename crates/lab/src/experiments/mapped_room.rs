@@ -15,7 +15,7 @@ use seese3_robot::fitting::{RoomReader, fit};
 use seese3_robot::planning::{Hops, LEAST_ARRIVAL_PROBABILITY, Route, RouteBounds};
 use seese3_robot::tracking::Map;
 
-use super::{Error, Within};
+use super::{Error, Within, check_hold_out};
 
 /// Settings of an evaluation, besides the rooms and the adapter.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -82,6 +82,7 @@ impl MappedRoom {
         adapter: &Arc<Adapter>,
         protocol: &PlanningProtocol,
     ) -> Result<Self, Error> {
+        check_hold_out(data.room, protocol.hold_out)?;
         let what = || format!("room '{}'", data.room.id());
         let rows = rows(&protocol.hold_out.mapped(data.room.timeline()));
         let frames = data.room.frames().select(&rows);

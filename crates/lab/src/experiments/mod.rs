@@ -34,10 +34,29 @@ pub mod seeds;
 mod simple_planners;
 pub mod tracking_scores;
 
+use seese3_core::room::Room;
+use seese3_core::splits::HoldOut;
 use seese3_core::{adapter, eval, navigation, splits, training, trajectory};
 use seese3_robot::{calibration, fitting, tracking, two_view};
 
 use crate::probes;
+
+/// Refuses a hold-out that leaves no frame of the room to ask for.
+///
+/// # Errors
+/// [`Error::Input`] if it does.
+pub fn check_hold_out(room: &Room, hold_out: HoldOut) -> Result<(), Error> {
+    if hold_out.tracked(room.timeline()).is_empty() {
+        return Err(Error::Input(format!(
+            "room '{}' is one sequence of {} frames, of which hold-out '{}' leaves none to track; \
+             'visit' needs a room of two sequences",
+            room.id(),
+            room.frame_count(),
+            hold_out.name()
+        )));
+    }
+    Ok(())
+}
 
 /// Why an experiment failed.
 #[derive(Debug, thiserror::Error)]
@@ -108,5 +127,34 @@ impl<T, E: Into<Error>> Within<T> for Result<T, E> {
             what: what(),
             problem: Box::new(problem.into()),
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use seese3_core::geometry::Pose;
+    use seese3_core::room::{Frames, Provenance, RoomId};
+
+    use super::*;
+
+    /// Oracle: the definition: another visit needs a second sequence.
+    #[test]
+    fn a_hold_out_without_frames_to_track_is_refused_by_name() {
+        let room = |sequences: Vec<u32>| {
+            let frames = Frames {
+                poses: vec![Pose::default(); 20],
+                sequences,
+                ..Frames::default()
+            };
+            Room::new(RoomId::new("hall").unwrap(), frames, Provenance::default()).unwrap()
+        };
+
+        let one = room(Vec::new());
+        let error = check_hold_out(&one, HoldOut::Visit).unwrap_err();
+        assert!(error.to_string().contains("'hall'"), "{error}");
+        assert!(check_hold_out(&one, HoldOut::Time).is_ok());
+
+        let two = room((0..20).map(|row| row / 10).collect());
+        assert!(check_hold_out(&two, HoldOut::Visit).is_ok());
     }
 }

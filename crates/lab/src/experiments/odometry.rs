@@ -25,7 +25,7 @@ use seese3_robot::tracking::{
 };
 
 use super::tracking_scores::TrackingScores;
-use super::{Error, Within};
+use super::{Error, Within, check_hold_out};
 use crate::json;
 
 /// Frame period of replays that contain frames of another room, nanoseconds: 30 Hz.
@@ -266,6 +266,7 @@ pub fn trackers<'a>(
     protocol: &OdometryProtocol,
 ) -> Result<Vec<TrackedRoom<'a>>, Error> {
     let tracker = |data: &RoomData<'a>| {
+        check_hold_out(data.room, protocol.hold_out)?;
         let room = Arc::new(data.room.clone());
         let mapped = protocol.hold_out.mapped(room.timeline());
         let navigator = Navigator::new(

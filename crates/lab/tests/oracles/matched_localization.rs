@@ -1,6 +1,7 @@
 //! Matched localization of a small synthetic recording.
 
 use nalgebra::Vector3;
+use ndarray::Array2;
 use seese3_core::geometry::Pose;
 use seese3_core::keypoints::Keypoints;
 use seese3_core::room::FrameId;
@@ -9,9 +10,7 @@ use seese3_lab::experiments::matched_localization::{
     MappedAndAsked, MatchedLocalization, evaluate,
 };
 use seese3_robot::matched_views::TrialRecording;
-use seese3_testing::keypoint_scene::{
-    Random, Scene, camera_path, distorted_camera, place_features,
-};
+use seese3_testing::keypoint_scene::{Random, Scene, camera_path, distorted_camera};
 use seese3_testing::near;
 
 /// Number of mapped frames.
@@ -46,14 +45,16 @@ fn recording() -> (Vec<Pose>, Vec<Keypoints>) {
 
 fn evaluated(mapped: &[FrameId], asked: &[FrameId]) -> Result<MatchedLocalization, Error> {
     let (poses, keypoints) = recording();
-    let features = place_features(&poses);
+    let features = Array2::from_shape_fn((poses.len(), 3), |(row, axis)| {
+        1.0 + poses[row].translation.vector[axis] as f32
+    });
     let recording = TrialRecording {
         poses: &poses,
         keypoints: &keypoints,
-        features: features.view(),
         camera: distorted_camera(),
     };
-    evaluate(recording, MappedAndAsked { mapped, asked }, &|| 0.0, &|| ())
+    let frames = MappedAndAsked { mapped, asked };
+    evaluate(recording, features.view(), frames, &|| 0.0, &|| ())
 }
 
 fn frames(rows: std::ops::Range<usize>) -> Vec<FrameId> {

@@ -24,9 +24,6 @@ const MIN_UNIT_KEYPOINTS: usize = 20;
 
 /// Median epipolar error of a map in which too few frames overlap to measure it, pixels.
 const DEFAULT_EPIPOLAR_PX: f64 = 1.0;
-/// Range of the RANSAC threshold, pixels, and its ratio to the median epipolar error.
-const THRESHOLDS_PX: [f64; 2] = [2.0, 4.0];
-const THRESHOLD_RATIO: f64 = 3.0;
 
 /// Minimum cosine of the descriptors of a match whose epipolar error is measured, and the number of
 /// keypoints of a frame that are matched.
@@ -94,12 +91,6 @@ impl KeypointMap {
     pub fn gap(&self, a: &Pose, b: &Pose) -> f64 {
         let between = a.inv_mul(b);
         between.translation.vector.norm() / self.unit_m + between.rotation.angle()
-    }
-
-    /// Largest reprojection error of an inlier, pixels.
-    pub fn threshold_px(&self) -> f64 {
-        let [least, most] = THRESHOLDS_PX;
-        (THRESHOLD_RATIO * self.epipolar_px).clamp(least, most)
     }
 }
 

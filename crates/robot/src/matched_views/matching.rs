@@ -170,7 +170,7 @@ impl<'a> Query<'a> {
 
         let search = Search {
             focal_px: pixel_focal(&self.map.camera),
-            threshold_px: self.map.threshold_px(),
+            threshold_px: parameters.threshold_px(self.map.epipolar_px),
             deviation_px: parameters.deviation_px,
             iterations: parameters.iterations,
             miss_probability: parameters.miss_probability,

@@ -61,6 +61,10 @@ pub struct MatchingParameters {
     pub candidates: usize,
     /// Minimum cosine of compressed descriptors.
     pub min_cosine: f32,
+    /// Largest reprojection error of an inlier, in median epipolar errors of the map.
+    pub threshold_ratio: f64,
+    /// Minimum and maximum of that error, pixels.
+    pub threshold_range_px: [f64; 2],
     /// Minimum and maximum number of RANSAC iterations.
     pub iterations: [usize; 2],
     /// Probability that RANSAC stops without an all-inlier sample.
@@ -80,6 +84,14 @@ pub struct MatchingParameters {
     pub max_rotation_deviation_rad: f64,
 }
 
+impl MatchingParameters {
+    /// Largest reprojection error of an inlier in a map with this median epipolar error, pixels.
+    pub(super) fn threshold_px(&self, epipolar_px: f64) -> f64 {
+        let [least, most] = self.threshold_range_px;
+        (self.threshold_ratio * epipolar_px).clamp(least, most)
+    }
+}
+
 impl Default for MatchingParameters {
     fn default() -> Self {
         Self {
@@ -87,6 +99,8 @@ impl Default for MatchingParameters {
             more_frames: 10,
             candidates: 600,
             min_cosine: 0.5,
+            threshold_ratio: 3.0,
+            threshold_range_px: [2.0, 4.0],
             iterations: [100, 1_000],
             miss_probability: 1e-4,
             deviation_px: 0.7,

@@ -46,7 +46,7 @@ fn keypoints(frame_count: usize, count: usize) -> RoomKeypoints {
     let mean = Array1::from_shape_fn(64, |_| random.normal() as f32);
     let axes = Array2::from_shape_fn((64, COMPRESSED), |_| random.normal() as f32);
     let map = KeypointMap {
-        camera: distorted_camera(),
+        camera: room("a").provenance().camera.unwrap(),
         unit_m: UNIT_M,
         epipolar_px: 0.7,
         noise: MapNoise {
@@ -216,8 +216,8 @@ async fn the_same_frames_keep_their_keypoints() {
     assert!(store.verify(&|_| ()).await.unwrap().is_empty());
 }
 
-/// Oracle: a view is retrieved by features of the keypoints' encoder. Features of another encoder
-/// under the same name cannot be compared with them.
+/// Oracle: the definition of the source: keypoints and features come from one encoder pass, and
+/// features of another encoder under the same name do not.
 #[tokio::test]
 async fn features_of_another_encoder_drop_the_keypoints_of_the_former() {
     let (_folder, store) = begun(&keypoints(FRAMES, 5)).await;
@@ -232,6 +232,24 @@ async fn features_of_another_encoder_drop_the_keypoints_of_the_former() {
     let back = store.load_room("a", None).await.unwrap();
     assert_eq!(back.features("f").unwrap().source().encoder, "another");
     assert!(back.keypoints.is_none());
+}
+
+/// Oracle: the definition of an inverse depth, which depends on the focal length: the same frames
+/// with a corrected camera do not have the depths of the former one.
+#[tokio::test]
+async fn another_camera_drops_the_keypoints_of_the_former() {
+    let (_folder, store) = begun(&keypoints(FRAMES, 5)).await;
+    let former = room("a");
+    let provenance = Provenance {
+        camera: Some(distorted_camera()),
+        ..former.provenance().clone()
+    };
+    let frames = former.frames().clone();
+    let corrected = Room::new(former.id().clone(), frames, provenance).unwrap();
+    store.publish_room(&corrected, &[]).await.unwrap();
+
+    let back = store.load_room("a", None).await.unwrap();
+    assert!(back.features("f").is_some() && back.keypoints.is_none());
 }
 
 /// Oracle: the promise of an extension. Known frames keep their keypoints, added frames have none;
