@@ -39,7 +39,7 @@
 //! | --- | --- |
 //! | [`matched_views`] | estimates a view's pose from keypoints matched with mapped keypoints |
 //! | [`tracking`] | tracks a camera frame by frame, with covariances |
-//! | [`localization`] | estimates where a view is in a mapped room from its keypoints |
+//! | [`localization`] | estimates where a view is in a mapped room, by the best method that answers |
 //! | [`planning`] | plans a route from a view to a goal, over a room's frames |
 //! | [`calibration`] | measures an adapter's errors in rooms that it was not trained on |
 //! | [`fitting`] | fits an adapter to one mapped room and localizes single views in it |

@@ -24,8 +24,9 @@ use seese3_core::geometry::{Pose, PoseError, body_twist};
 use seese3_core::navigation::{self, Outcome, Start, Stepper, pursue};
 use seese3_core::room::FrameId;
 use seese3_core::training::RoomData;
-use seese3_robot::planning::{BelievedStart, KnownRoom, Planned, plan};
-use seese3_robot::tracking::PoseReader;
+use seese3_robot::localization::AdapterLocalizer;
+use seese3_robot::planning::{BelievedStart, Planned, plan};
+use seese3_robot::tracking::{MapQuery, PoseReader};
 
 use super::Error;
 pub use super::mapped_room::{MappedRoom, PlannedWay, PlanningProtocol, PlanningQuestion};
@@ -149,13 +150,15 @@ fn answer(
 }
 
 fn ours(room: &MappedRoom, question: &PlanningQuestion) -> Result<PlannedWay, Error> {
-    let known = KnownRoom {
+    let localizer = AdapterLocalizer {
         navigator: &room.navigator,
         map: room.map.as_ref(),
         reader: room.reader.as_ref().map(|reader| reader as &dyn PoseReader),
     };
-    let feature = Some(question.feature.as_slice());
-    let start = BelievedStart::seen(known, question.latent.view(), feature);
+    let start = BelievedStart::of_adapter(localizer.estimate(MapQuery {
+        latent: question.latent.view(),
+        feature: Some(question.feature.as_slice()),
+    }));
     let goal = room.poses()[question.goal.row()];
     let planned = plan(
         &room.navigator,

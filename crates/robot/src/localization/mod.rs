@@ -1,152 +1,142 @@
-//! Estimates where a view is in a mapped room, by matching its keypoints with those of the map.
+//! Estimates where a view is in a mapped room.
 //!
-//! 1. The mapped frames most similar to the view are retrieved by their keypoints or, near a
-//!    predicted pose, by their poses.
-//! 2. The view's keypoints are matched with theirs, and the pose is estimated
-//!    ([`KeypointMap::match_view`]).
-//! 3. The pose is accepted if enough keypoints agree with it and its covariance is small enough.
+//! - [`KeypointRoom`] matches the keypoints of a view with those of the map.
+//! - [`AdapterLocalizer`] estimates the pose from the most similar mapped frames: by the adapter
+//!   that is fitted to the room, by a blend of several frames, or by the nearest frame.
+//! - [`RoomLocalizer`] chooses between them. Matched keypoints come first. The others answer only
+//!   if the view resembles the room.
 
-use std::sync::Arc;
+mod adapter_localizer;
+mod camera_search;
+mod keypoint_room;
 
-use crate::matched_views::{
-    Candidates, KeypointMap, MatchedView, MatchingParameters, PlaceIndex, ViewKeypoints,
-};
-use crate::tracking::PoseWithCovariance;
+pub use adapter_localizer::{AdapterEstimate, AdapterLocalizer};
+pub use camera_search::{FOCAL_CANDIDATES, camera_of_views};
+pub use keypoint_room::{KeypointRoom, LocatedView, NotLocated};
+
+use nalgebra::Matrix6;
+
+use crate::matched_views::ViewKeypoints;
+use crate::tracking::MapQuery;
 use seese3_core::geometry::Pose;
 
-/// A mapped room in which views are located by their keypoints.
-#[derive(Debug, Clone)]
-pub struct KeypointRoom {
-    /// `world_from_camera` of the mapped frames.
-    poses: Vec<Pose>,
-    places: PlaceIndex,
-    map: Arc<KeypointMap>,
-    parameters: MatchingParameters,
+/// How a pose was estimated from a view.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Method {
+    /// From keypoints that were matched with those of the map.
+    MatchedKeypoints,
+    /// By the adapter that is fitted to the room.
+    FittedAdapter,
+    /// From several similar mapped frames.
+    SimilarFrames,
+    /// The pose of the most similar mapped frame.
+    NearestFrame,
 }
 
-/// The pose of a view that agrees with the map.
+/// The localizers of one room.
+#[derive(Clone, Copy)]
+pub struct RoomLocalizer<'a> {
+    /// The keypoints of the room, if it has any.
+    pub keypoints: Option<&'a KeypointRoom>,
+    /// The room under an adapter, if one serves it.
+    pub adapter: Option<AdapterLocalizer<'a>>,
+}
+
+/// What is known of a view.
+#[derive(Clone, Copy)]
+pub struct ViewToLocate<'a> {
+    /// Its keypoints and camera, if it is an image.
+    pub keypoints: Option<ViewKeypoints<'a>>,
+    /// Its latent and feature under the adapter of [`RoomLocalizer`].
+    pub query: Option<MapQuery<'a>>,
+}
+
+/// Estimated pose of a view.
 #[derive(Debug, Clone)]
-pub struct LocatedView {
+pub struct PoseEstimate {
     /// `world_from_camera`.
-    pub pose: PoseWithCovariance,
-    /// Number of the view's keypoints that agree with the pose.
-    pub inliers: usize,
-    /// The matches.
-    pub matched: MatchedView,
+    pub pose: Pose,
+    /// Covariance of δ in true = pose · exp(δ), ordered (v, ω), meters and radians; `None` if the
+    /// errors of the method were not measured.
+    pub covariance: Option<Matrix6<f64>>,
+    /// How the pose was estimated.
+    pub method: Method,
+    /// How unlike the view is to the room, relative to the limit of the method; at most 1. `None`
+    /// if unknown.
+    pub novelty: Option<f64>,
+    /// The matched keypoints of [`Method::MatchedKeypoints`].
+    pub located: Option<LocatedView>,
+    /// Why matched keypoints did not give the pose, if they were tried.
+    pub unmatched: Option<NotLocated>,
 }
 
-/// Why a view is not located.
-#[derive(Debug, thiserror::Error, Clone, Copy, PartialEq)]
-#[allow(missing_docs, reason = "each variant's message says what it is")]
-pub enum NotLocated {
-    #[error("the view has no keypoints: it is blank, blurred or covered")]
-    NoKeypoints,
-    #[error(
-        "only {inliers} of {keypoints} keypoints agree with the map; the view is not in the map"
-    )]
-    NotInMap { inliers: usize, keypoints: usize },
-    #[error(
-        "{inliers} keypoints agree with the map, but in a small part of the image or too far from it: the pose is \
-         uncertain by {position_m:.2} m and {rotation_deg:.1} degrees"
-    )]
-    Uncertain {
-        inliers: usize,
-        position_m: f64,
-        rotation_deg: f64,
-    },
+/// A view that is not in the map, as far as is known.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NotInRoom {
+    /// How unlike the view is to the room, relative to the limit; above 1.
+    pub novelty: f64,
+    /// Why its keypoints do not locate it, if they were tried.
+    pub unmatched: Option<NotLocated>,
+    /// The estimate from the most similar frames, which is not to be trusted.
+    pub nearest: Option<AdapterEstimate>,
 }
 
-impl KeypointRoom {
-    /// A room with these mapped frames: poses `world_from_camera`, and their keypoints.
-    ///
-    /// # Panics
-    /// If poses and map are not of the same number of frames.
-    pub fn new(poses: Vec<Pose>, map: Arc<KeypointMap>) -> Self {
-        assert_eq!(poses.len(), map.frames.len());
-        Self {
-            poses,
-            places: PlaceIndex::of(&map),
-            map,
-            parameters: MatchingParameters::default(),
-        }
-    }
-
-    /// The keypoints of the room.
-    pub fn map(&self) -> &KeypointMap {
-        &self.map
-    }
-
+impl RoomLocalizer<'_> {
     /// Estimates the pose of a view.
     ///
     /// # Errors
-    /// [`NotLocated`] if the view does not agree with the map.
-    pub fn locate(&self, view: ViewKeypoints<'_>) -> Result<LocatedView, NotLocated> {
-        self.locate_among(view, Candidates::Similar(&self.places))
-    }
-
-    /// Estimates the pose of a view near a predicted pose, `world_from_camera`.
-    ///
-    /// # Errors
-    /// [`NotLocated`] if the view does not agree with the map.
-    pub fn locate_near(
-        &self,
-        view: ViewKeypoints<'_>,
-        predicted: &Pose,
-    ) -> Result<LocatedView, NotLocated> {
-        self.locate_among(view, Candidates::Near(predicted))
-    }
-
-    fn locate_among(
-        &self,
-        view: ViewKeypoints<'_>,
-        candidates: Candidates<'_>,
-    ) -> Result<LocatedView, NotLocated> {
-        let keypoints = view.keypoints;
-        if keypoints.is_empty() {
-            return Err(NotLocated::NoKeypoints);
-        }
-
-        let matched = self
-            .map
-            .match_view(view, candidates, &self.poses, &self.parameters);
-        let not_in_map = |inliers: usize| NotLocated::NotInMap {
-            inliers,
-            keypoints: keypoints.len(),
+    /// [`NotInRoom`] if too few keypoints agree with the map and the view does not resemble the
+    /// mapped frames either.
+    pub fn locate(&self, view: ViewToLocate<'_>) -> Result<PoseEstimate, NotInRoom> {
+        let unmatched = match self.keypoints.zip(view.keypoints) {
+            Some((room, keypoints)) => match room.locate(keypoints) {
+                Ok(located) => return Ok(PoseEstimate::matched(located)),
+                Err(why) => Some(why),
+            },
+            None => None,
         };
-        let matched = matched.ok_or_else(|| not_in_map(0))?;
-        let inliers = matched.inliers;
-        if inliers < self.parameters.min_inliers {
-            return Err(not_in_map(inliers));
-        }
 
-        let covariance = matched.information.covariance(&self.map.noise);
-        let pose = PoseWithCovariance {
-            pose: matched.pose,
-            covariance: covariance.ok_or_else(|| not_in_map(inliers))?,
+        let adapter = self.adapter.zip(view.query);
+        let nearest = adapter.map(|(adapter, query)| adapter.estimate(query));
+        let by_keypoints = unmatched.map(|why| why.novelty());
+        let novelty = match &nearest {
+            Some(estimate) => estimate.novelty.or(by_keypoints),
+            None => Some(by_keypoints.unwrap_or(f64::INFINITY)),
         };
-        let position_m = pose.position_deviation_m();
-        let rotation_rad = pose.rotation_deviation_rad();
-        let MatchingParameters {
-            min_spread,
-            max_position_deviation,
-            max_rotation_deviation_rad,
-            ..
-        } = self.parameters;
-        let is_certain = matched.spread >= min_spread
-            && position_m <= max_position_deviation * self.map.unit_m
-            && rotation_rad <= max_rotation_deviation_rad;
-        if !is_certain {
-            return Err(NotLocated::Uncertain {
-                inliers,
-                position_m,
-                rotation_deg: rotation_rad.to_degrees(),
-            });
-        }
 
-        Ok(LocatedView {
-            pose,
-            inliers,
-            matched,
-        })
+        // A wrong camera is the caller's mistake, which a less accurate method must not hide.
+        let is_contradicted = matches!(unmatched, Some(NotLocated::CameraContradicted { .. }));
+        match (nearest, novelty) {
+            (Some(estimate), novelty)
+                if novelty.is_none_or(|novelty| novelty <= 1.0) && !is_contradicted =>
+            {
+                Ok(PoseEstimate {
+                    pose: estimate.pose,
+                    covariance: estimate.covariance,
+                    method: estimate.method,
+                    novelty,
+                    located: None,
+                    unmatched,
+                })
+            }
+            (nearest, novelty) => Err(NotInRoom {
+                novelty: by_keypoints.or(novelty).unwrap_or(f64::INFINITY),
+                unmatched,
+                nearest,
+            }),
+        }
+    }
+}
+
+impl PoseEstimate {
+    fn matched(located: LocatedView) -> Self {
+        Self {
+            pose: located.pose.pose,
+            covariance: Some(located.pose.covariance),
+            method: Method::MatchedKeypoints,
+            novelty: Some(located.novelty),
+            located: Some(located),
+            unmatched: None,
+        }
     }
 }

@@ -2,7 +2,8 @@
 //! robust refinement.
 
 use nalgebra::{
-    Cholesky, Isometry3, Matrix2, Matrix2x3, Matrix2x6, Matrix6, Point3, Vector2, Vector3, Vector6,
+    Cholesky, Isometry3, Matrix2, Matrix2x3, Matrix2x6, Matrix6, Point3, SMatrix, SVector, Vector2,
+    Vector3, Vector6,
 };
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -20,6 +21,14 @@ const FINAL_STEPS: usize = 8;
 const DEGREES_OF_FREEDOM: f64 = 4.0;
 /// Number of matches after which a hypothesis that is already worse than the best is dropped.
 const BLOCK: usize = 32;
+/// Thresholds of the joint refinement of pose and focal length, step by step, in thresholds of an
+/// inlier. They begin wide, because a wrong focal length leaves errors at the edges of the image.
+const FOCAL_THRESHOLDS: [f64; 10] = [4.0, 4.0, 3.0, 3.0, 2.0, 2.0, 1.5, 1.0, 1.0, 1.0];
+/// Largest change of the logarithm of the focal length in one step.
+const MAX_FOCAL_STEP: f64 = 0.1;
+/// Largest logarithm of a fitted focal length over the stated one. Beyond it, the fit has shrunk the
+/// view to a point.
+const MAX_LOG_FOCAL: f64 = 0.6;
 /// Minimum depth of a map point in front of the camera, meters.
 const MIN_DEPTH: f64 = 1e-6;
 
@@ -99,6 +108,19 @@ pub(super) struct Found {
     /// Information matrix (inverse covariance) of δ in true = pose · exp(δ), ordered (v, ω), if
     /// the errors of all matches were independent.
     pub information: Matrix6<f64>,
+    /// The focal length that fits the matches best, if there is one.
+    pub focal: Option<FocalFit>,
+}
+
+/// The focal length of a view that agrees with the most matches.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FocalFit {
+    /// Fitted focal length divided by the stated one.
+    pub factor: f64,
+    /// Number of matches that agree with the fitted focal length.
+    pub inliers: usize,
+    /// Variance of the logarithm of `factor`, if the errors of all matches were independent.
+    pub independent_variance: f64,
 }
 
 /// The pose with the most support; `None` if no sample gives a pose.
@@ -262,10 +284,77 @@ impl Search {
 
         let information = self.normal_equations(matches, &inliers, &pose).information;
         let inliers = self.inliers(matches, &pose.inverse());
+        let focal = self.focal_fit(matches, &pose);
         Some(Found {
             pose,
             inliers,
             information,
+            focal,
+        })
+    }
+
+    /// Refines a pose together with the focal length, and counts the matches that then agree.
+    /// `None` if the fit does not converge.
+    fn focal_fit(&self, matches: &[Correspondence], pose: &Pose) -> Option<FocalFit> {
+        let mut pose = *pose;
+        let mut log_factor = 0.0_f64;
+        let mut variance = f64::INFINITY;
+        let scaled = |match_: &Correspondence, log_factor: f64| Correspondence {
+            plane: match_.plane * (-log_factor).exp(),
+            ..*match_
+        };
+
+        for threshold_ratio in FOCAL_THRESHOLDS {
+            let threshold = threshold_ratio * self.threshold_px;
+            let mut information = SMatrix::<f64, 7, 7>::zeros();
+            let mut gradient = SVector::<f64, 7>::zeros();
+            for match_ in matches {
+                let match_ = scaled(match_, log_factor);
+                let Some(row) = self.linearized(&match_, &pose) else {
+                    continue;
+                };
+                let squared = row.residual.norm_squared();
+                if squared > threshold * threshold {
+                    continue;
+                }
+
+                // A longer focal length moves the point on the plane at depth 1 to the center.
+                let mut by_step = SMatrix::<f64, 2, 7>::zeros();
+                by_step.fixed_columns_mut::<6>(0).copy_from(&row.by_step);
+                by_step
+                    .column_mut(6)
+                    .copy_from(&(match_.plane * self.focal_px));
+                let weight = 1.0 / (1.0 + squared / (0.5 * threshold).powi(2));
+                information += by_step.transpose() * by_step * weight;
+                gradient += by_step.transpose() * row.residual * weight;
+            }
+
+            let cholesky = Cholesky::new(information)?;
+            // Long steps leave the range in which the projection is nearly linear.
+            let mut step = cholesky.solve(&gradient);
+            step *= (MAX_FOCAL_STEP / step[6].abs()).min(1.0);
+            if !step.iter().all(|x| x.is_finite()) {
+                return None;
+            }
+            let unit = SVector::<f64, 7>::from_fn(|row, _| if row == 6 { 1.0 } else { 0.0 });
+            variance = cholesky.solve(&unit)[6] * self.deviation_px * self.deviation_px;
+            let by_pose: Vector6<f64> = step.fixed_rows::<6>(0).into();
+            pose *= exp(&Twist::from_vector(&by_pose));
+            log_factor += step[6];
+            if log_factor.abs() > MAX_LOG_FOCAL {
+                return None;
+            }
+        }
+
+        let threshold = self.threshold_px * self.threshold_px;
+        let camera_from_world = pose.inverse();
+        let agrees = |match_: &&Correspondence| {
+            self.squared_error(&scaled(match_, log_factor), &camera_from_world) < threshold
+        };
+        Some(FocalFit {
+            factor: log_factor.exp(),
+            inliers: matches.iter().filter(agrees).count(),
+            independent_variance: variance,
         })
     }
 
@@ -366,11 +455,16 @@ pub struct PoseInformation {
 }
 
 impl PoseInformation {
+    /// Factor on the variances of independent matches.
+    pub fn factor(&self, noise: &MapNoise) -> f64 {
+        noise.design_effect * (1.0 + self.gap / noise.gap_scale)
+    }
+
     /// Covariance of δ in true = pose · exp(δ), ordered (v, ω), meters and radians, where the true
     /// pose is stated with the same noise as the poses of the map; `None` if the matches do not
     /// determine the pose.
     pub fn covariance(&self, noise: &MapNoise) -> Option<Matrix6<f64>> {
-        let factor = noise.design_effect * (1.0 + self.gap / noise.gap_scale);
+        let factor = self.factor(noise);
         let [v, w] = [noise.translation_m, noise.rotation_rad].map(|deviation| deviation.powi(2));
         let stated = Matrix6::from_diagonal(&Vector6::new(v, v, v, w, w, w));
         let covariance = Cholesky::new(self.independent)?.inverse() * factor + stated;

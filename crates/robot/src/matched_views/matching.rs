@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use nalgebra::Vector2;
 use ndarray::Array2;
 
-use super::absolute_pose::{Correspondence, PoseInformation, Search, find_pose};
+use super::absolute_pose::{Correspondence, FocalFit, PoseInformation, Search, find_pose};
 use super::descriptors::{mutual_matches, unpacked};
 use super::keypoint_map::KeypointMap;
 use super::parameters::MatchingParameters;
@@ -52,6 +52,8 @@ pub struct MatchedView {
     pub spread: f64,
     /// Information of the matches about the pose.
     pub information: PoseInformation,
+    /// The focal length of the view that fits the matches best, if there is one.
+    pub focal: Option<FocalFit>,
     /// The inliers.
     pub matches: Vec<InlierMatch>,
 }
@@ -210,6 +212,7 @@ impl<'a> Query<'a> {
                 independent: found.information,
                 gap,
             },
+            focal: found.focal,
             matches,
         })
     }

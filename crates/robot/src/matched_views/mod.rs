@@ -16,12 +16,12 @@ mod p3p;
 mod parameters;
 mod triangulation;
 
-pub use absolute_pose::{MapNoise, PoseInformation};
+pub use absolute_pose::{FocalFit, MapNoise, PoseInformation};
 pub use descriptors::{COMPRESSED, DescriptorBasis};
 pub use keypoint_map::{KeypointMap, MappedKeypoints, Mapping, epipolar_pairs};
 pub use matching::{Candidates, InlierMatch, MatchedView, ViewKeypoints};
 pub use noise::{Trial, TrialRecording, fitted_noise, squared_length, trials};
-pub use parameters::{MappingParameters, MatchingParameters};
+pub use parameters::{FocalGate, MappingParameters, MatchingParameters};
 pub use retrieval::PlaceIndex;
 
 /// Why a keypoint map cannot be computed.

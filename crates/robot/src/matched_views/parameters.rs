@@ -82,6 +82,23 @@ pub struct MatchingParameters {
     pub max_position_deviation: f64,
     /// Largest standard deviation of an accepted rotation, radians.
     pub max_rotation_deviation_rad: f64,
+    /// Smallest difference between the logarithms of the fitted and the stated focal length that
+    /// can contradict the stated one.
+    pub min_log_focal: f64,
+    /// Gate of a view with the focal length of the mapping camera.
+    pub mapping_focal_gate: FocalGate,
+    /// Gate of a view with another focal length.
+    pub other_focal_gate: FocalGate,
+}
+
+/// Limits beyond which the matches contradict a stated focal length.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FocalGate {
+    /// Largest difference between the logarithms of the fitted and the stated focal length,
+    /// standard deviations.
+    pub max_deviations: f64,
+    /// Largest ratio of the inliers with the fitted focal length to those with the stated one.
+    pub max_inlier_ratio: f64,
 }
 
 impl MatchingParameters {
@@ -109,6 +126,15 @@ impl Default for MatchingParameters {
             min_spread: 0.016,
             max_position_deviation: 0.05,
             max_rotation_deviation_rad: 3_f64.to_radians(),
+            min_log_focal: 0.05,
+            mapping_focal_gate: FocalGate {
+                max_deviations: 4.0,
+                max_inlier_ratio: 1.6,
+            },
+            other_focal_gate: FocalGate {
+                max_deviations: 2.5,
+                max_inlier_ratio: 1.15,
+            },
         }
     }
 }

@@ -13,7 +13,7 @@ mod start;
 
 pub use arrival::arrival_probability;
 pub use pose_graph::{Hops, NoRoute, PoseGraph, Route, RouteBounds};
-pub use start::{BelievedStart, KnownRoom};
+pub use start::BelievedStart;
 
 use crate::tracking::PoseWithCovariance;
 use seese3_core::cancel::{Cancellation, Cancelled};

@@ -1,22 +1,10 @@
 //! The estimated start pose of a route.
 
 use nalgebra::Matrix6;
-use ndarray::ArrayView1;
 
-use crate::tracking::{Map, MapQuery, PoseReader, PoseWithCovariance};
+use crate::localization::{AdapterEstimate, NotInRoom, PoseEstimate};
+use crate::tracking::{Map, MapQuery};
 use seese3_core::geometry::Pose;
-use seese3_core::navigation::Navigator;
-
-/// The localizers of one room.
-#[derive(Clone, Copy)]
-pub struct KnownRoom<'a> {
-    /// The room with an adapter's latents.
-    pub navigator: &'a Navigator,
-    /// Map of the room, if the adapter is calibrated.
-    pub map: Option<&'a Map>,
-    /// Localizer from raw features, if an adapter was fitted to the room.
-    pub reader: Option<&'a dyn PoseReader>,
-}
 
 /// Estimated start pose of a camera.
 #[derive(Debug, Clone, PartialEq)]
@@ -44,45 +32,41 @@ impl BelievedStart {
         }
     }
 
-    /// A start at a pose given by the caller, for a view with this latent, shape (k,).
-    pub fn given(pose: Pose, room: KnownRoom<'_>, latent: ArrayView1<'_, f64>) -> Self {
-        let matched = room
-            .map
-            .map(|map| map.match_view(MapQuery::of_latent(latent), 1));
+    /// A start at a pose given by the caller, for a view of the room with this map, if it has one.
+    pub fn given(pose: Pose, map: Option<&Map>, query: MapQuery<'_>) -> Self {
+        let matched = map.map(|map| map.match_view(query, 1));
         Self {
             out_of_distribution: matched.map(|found| found.out_of_distribution),
             ..Self::recorded(pose)
         }
     }
 
-    /// Estimates the start pose from a view: its latent, shape (k,), and its raw feature, shape
-    /// (d,), if known.
-    ///
-    /// The pose comes from the fitted adapter, within its validated range. Otherwise it is blended
-    /// from the most similar frames of the map. Without a calibrated adapter it is the pose of the
-    /// nearest frame.
-    pub fn seen(room: KnownRoom<'_>, latent: ArrayView1<'_, f64>, feature: Option<&[f32]>) -> Self {
-        let query = MapQuery { latent, feature };
-        let matched = room.map.map(|map| map.match_view(query, 1));
-        let reader = room.reader.zip(feature);
-        let read = reader.and_then(|(reader, feature)| reader.read_pose(feature));
-
-        // Without a calibrated adapter, the validated range of the reader is the limit.
-        let out_of_distribution = match &matched {
-            Some(found) => Some(found.out_of_distribution),
-            None => reader.and_then(|(reader, feature)| reader.distance_over_range(feature)),
-        };
-
-        let belief: Option<PoseWithCovariance> = read.or(matched.map(|found| found.anchor.belief));
+    /// A start at the pose that the most similar frames give.
+    pub fn of_adapter(estimate: AdapterEstimate) -> Self {
         Self {
-            // A room has at least one frame, so the list of nearest frames is not empty.
-            pose: match &belief {
-                Some(belief) => belief.pose,
-                None => room.navigator.nearest(latent, 1)[0].pose,
-            },
-            covariance: belief.map(|belief| belief.covariance),
-            out_of_distribution,
+            pose: estimate.pose,
+            covariance: estimate.covariance,
+            out_of_distribution: estimate.novelty,
             is_seen: true,
+        }
+    }
+
+    /// A start at the estimated pose of a view. A view that is not in the room keeps the pose of
+    /// the most similar frames, beyond the limit; `None` if there is no such pose.
+    pub fn seen(found: Result<PoseEstimate, NotInRoom>) -> Option<Self> {
+        match found {
+            Ok(estimate) => Some(Self {
+                pose: estimate.pose,
+                covariance: estimate.covariance,
+                out_of_distribution: estimate.novelty,
+                is_seen: true,
+            }),
+            Err(NotInRoom {
+                nearest, novelty, ..
+            }) => Some(Self {
+                out_of_distribution: Some(novelty),
+                ..Self::of_adapter(nearest?)
+            }),
         }
     }
 

@@ -1,0 +1,268 @@
+//! Locates views in a mapped room by matching their keypoints with those of the map.
+//!
+//! 1. The mapped frames most similar to the view are retrieved by their keypoints or, near a
+//!    predicted pose, by their poses.
+//! 2. The view's keypoints are matched with theirs, and the pose is estimated
+//!    ([`KeypointMap::match_view`]).
+//! 3. The pose is accepted if enough keypoints agree with it, its covariance is small enough, and
+//!    the matches do not contradict the focal length of the view's camera.
+
+use std::sync::Arc;
+
+use crate::matched_views::{
+    Candidates, FocalFit, KeypointMap, MatchedView, MatchingParameters, PlaceIndex, ViewKeypoints,
+};
+use crate::tracking::PoseWithCovariance;
+use seese3_core::geometry::{CameraIntrinsics, Pose};
+
+/// Largest difference between the logarithms of two focal lengths of one camera.
+const SAME_LOG_FOCAL: f64 = 0.02;
+
+/// A mapped room in which views are located by their keypoints.
+#[derive(Debug, Clone)]
+pub struct KeypointRoom {
+    /// `world_from_camera` of the mapped frames.
+    poses: Vec<Pose>,
+    places: PlaceIndex,
+    map: Arc<KeypointMap>,
+    parameters: MatchingParameters,
+}
+
+/// The pose of a view that agrees with the map.
+#[derive(Debug, Clone)]
+pub struct LocatedView {
+    /// `world_from_camera`.
+    pub pose: PoseWithCovariance,
+    /// Number of the view's keypoints that agree with the pose.
+    pub inliers: usize,
+    /// The largest ratio of a gate's limit to the view's value; at most 1. It is 1 for a view with
+    /// the fewest accepted inliers, for example.
+    pub novelty: f64,
+    /// The matches.
+    pub matched: MatchedView,
+}
+
+/// Why a view is not located.
+#[derive(Debug, thiserror::Error, Clone, Copy, PartialEq)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
+pub enum NotLocated {
+    #[error("the view has no keypoints: it is blank, blurred or covered")]
+    NoKeypoints,
+    #[error("only {inliers} of {keypoints} keypoints agree with the map, of {needed} needed")]
+    NotInMap {
+        inliers: usize,
+        keypoints: usize,
+        needed: usize,
+    },
+    #[error(
+        "{inliers} keypoints agree with the map, but in a small part of the image or too far from it: the pose is \
+         uncertain by {position_m:.2} m and {rotation_deg:.1} degrees"
+    )]
+    Uncertain {
+        inliers: usize,
+        position_m: f64,
+        rotation_deg: f64,
+        novelty: f64,
+    },
+    #[error(
+        "the matches contradict the focal length of the view's camera: with {stated:.3} image widths {inliers} \
+         keypoints agree, with {fitted:.3} image widths {fitted_inliers}"
+    )]
+    CameraContradicted {
+        /// Image widths.
+        stated: f64,
+        /// Image widths.
+        fitted: f64,
+        inliers: usize,
+        fitted_inliers: usize,
+    },
+}
+
+impl NotLocated {
+    /// The largest ratio of a gate's limit to the view's value; above 1.
+    pub fn novelty(&self) -> f64 {
+        match *self {
+            Self::NoKeypoints => f64::INFINITY,
+            Self::NotInMap {
+                inliers, needed, ..
+            } => needed as f64 / inliers as f64,
+            Self::Uncertain { novelty, .. } => novelty,
+            Self::CameraContradicted { stated, fitted, .. } => 1.0 + (fitted / stated).ln().abs(),
+        }
+    }
+}
+
+impl KeypointRoom {
+    /// A room with these mapped frames: poses `world_from_camera`, and their keypoints.
+    ///
+    /// # Panics
+    /// If poses and map are not of the same number of frames.
+    pub fn new(poses: Vec<Pose>, map: Arc<KeypointMap>) -> Self {
+        assert_eq!(poses.len(), map.frames.len());
+        Self {
+            poses,
+            places: PlaceIndex::of(&map),
+            map,
+            parameters: MatchingParameters::default(),
+        }
+    }
+
+    /// The keypoints of the room.
+    pub fn map(&self) -> &KeypointMap {
+        &self.map
+    }
+
+    /// Estimates the pose of a view.
+    ///
+    /// # Errors
+    /// [`NotLocated`] if the view does not agree with the map.
+    pub fn locate(&self, view: ViewKeypoints<'_>) -> Result<LocatedView, NotLocated> {
+        self.locate_among(view, Candidates::Similar(&self.places))
+    }
+
+    /// Estimates the pose of a view near a predicted pose, `world_from_camera`.
+    ///
+    /// # Errors
+    /// [`NotLocated`] if the view does not agree with the map.
+    pub fn locate_near(
+        &self,
+        view: ViewKeypoints<'_>,
+        predicted: &Pose,
+    ) -> Result<LocatedView, NotLocated> {
+        self.locate_among(view, Candidates::Near(predicted))
+    }
+
+    /// The focal length that fits a view's matches best, image widths, and the number of matches
+    /// that agree with it; `None` if they are too few.
+    pub(super) fn focal_fit(&self, view: ViewKeypoints<'_>) -> Option<(f64, usize)> {
+        let candidates = Candidates::Similar(&self.places);
+        let matched = self
+            .map
+            .match_view(view, candidates, &self.poses, &self.parameters)?;
+        let FocalFit {
+            factor, inliers, ..
+        } = matched.focal?;
+        let is_enough = inliers >= self.parameters.min_inliers;
+        is_enough.then_some((view.camera.focal().x * factor, inliers))
+    }
+
+    fn locate_among(
+        &self,
+        view: ViewKeypoints<'_>,
+        candidates: Candidates<'_>,
+    ) -> Result<LocatedView, NotLocated> {
+        let keypoints = view.keypoints;
+        if keypoints.is_empty() {
+            return Err(NotLocated::NoKeypoints);
+        }
+
+        let matched = self
+            .map
+            .match_view(view, candidates, &self.poses, &self.parameters);
+        let not_in_map = |inliers: usize| NotLocated::NotInMap {
+            inliers,
+            keypoints: keypoints.len(),
+            needed: self.parameters.min_inliers,
+        };
+        let matched = matched.ok_or_else(|| not_in_map(0))?;
+        if let Some(contradicted) = self.contradicted(&matched, view.camera) {
+            return Err(contradicted);
+        }
+
+        let inliers = matched.inliers;
+        if inliers < self.parameters.min_inliers {
+            return Err(not_in_map(inliers));
+        }
+
+        let covariance = matched.information.covariance(&self.map.noise);
+        let pose = PoseWithCovariance {
+            pose: matched.pose,
+            covariance: covariance.ok_or_else(|| not_in_map(inliers))?,
+        };
+        let novelty = self.novelty(&matched, &pose);
+        if novelty > 1.0 {
+            return Err(NotLocated::Uncertain {
+                inliers,
+                position_m: pose.position_deviation_m(),
+                rotation_deg: pose.rotation_deviation_rad().to_degrees(),
+                novelty,
+            });
+        }
+
+        Ok(LocatedView {
+            pose,
+            inliers,
+            novelty,
+            matched,
+        })
+    }
+
+    /// The largest ratio of a gate's limit to the view's value.
+    fn novelty(&self, matched: &MatchedView, pose: &PoseWithCovariance) -> f64 {
+        let MatchingParameters {
+            min_inliers,
+            min_spread,
+            max_position_deviation,
+            max_rotation_deviation_rad,
+            ..
+        } = self.parameters;
+        let ratios = [
+            min_inliers as f64 / matched.inliers as f64,
+            min_spread / matched.spread,
+            pose.position_deviation_m() / (max_position_deviation * self.map.unit_m),
+            pose.rotation_deviation_rad() / max_rotation_deviation_rad,
+        ];
+        ratios.into_iter().fold(0.0, f64::max)
+    }
+
+    /// Compares the stated focal length of a view with the one that fits its matches best.
+    ///
+    /// The fitted focal length varies with errors of the map, above all far from the mapped frames.
+    /// A focal length that differs from that of the mapping camera is therefore refused sooner.
+    fn contradicted(&self, matched: &MatchedView, camera: &CameraIntrinsics) -> Option<NotLocated> {
+        let MatchingParameters {
+            confident_inliers,
+            min_inliers,
+            min_log_focal,
+            mapping_focal_gate,
+            other_focal_gate,
+            ..
+        } = self.parameters;
+        let FocalFit {
+            factor,
+            inliers,
+            independent_variance,
+        } = matched.focal?;
+
+        // Among the matches of a view that is not in the map, some focal length always fits a few.
+        let enough = if matched.inliers < min_inliers {
+            confident_inliers
+        } else {
+            min_inliers
+        };
+        let log_factor = factor.ln().abs();
+        if log_factor < min_log_focal || inliers < enough {
+            return None;
+        }
+
+        let stated = camera.focal().x;
+        let is_of_map = (stated / self.map.camera.focal().x).ln().abs() < SAME_LOG_FOCAL;
+        let gate = if is_of_map {
+            mapping_focal_gate
+        } else {
+            other_focal_gate
+        };
+        let variance = independent_variance * matched.information.factor(&self.map.noise);
+        let deviations = log_factor / variance.sqrt();
+        let inlier_ratio = inliers as f64 / matched.matches.len() as f64;
+        let is_contradicted =
+            deviations > gate.max_deviations || inlier_ratio > gate.max_inlier_ratio;
+
+        is_contradicted.then(|| NotLocated::CameraContradicted {
+            stated,
+            fitted: stated * factor,
+            inliers: matched.matches.len(),
+            fitted_inliers: inliers,
+        })
+    }
+}
