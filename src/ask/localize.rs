@@ -1,11 +1,13 @@
-//! `seese3 localize`: the mapped frames most similar to a view, and the camera pose.
+//! `seese3 localize`: the camera pose of a view, and the mapped frames most similar to it.
 
 use anyhow::Context;
 use clap::Args;
 
 use super::{
-    FeatureRow, Server, deviations_text, error_text, frame_text, pose_text, revision, wire_json,
+    FeatureRow, Server, ViewCamera, error_text, estimate_text, fitted_text, frame_text,
+    matches_text, revision, wire_json,
 };
+use crate::camera::CAMERA_FORM;
 use crate::output::{JsonOutput, say};
 use seese3_client::proto::v1 as pb;
 
@@ -24,6 +26,10 @@ pub struct Localize {
     frame: Option<u32>,
     #[command(flatten)]
     feature: FeatureRow,
+    /// Camera of --image, as --camera of `seese3 import`, or "mapping" for the camera that mapped the
+    /// room. Required if the room has keypoints
+    #[arg(long, value_name = CAMERA_FORM, requires = "image")]
+    camera: Option<ViewCamera>,
     /// Number of frames returned, over all rooms, best first
     #[arg(long, default_value_t = 5)]
     top_k: u32,
@@ -44,22 +50,37 @@ impl Localize {
             adapter: self.adapter,
             view: Some(view),
             top_k: Some(self.top_k),
+            camera: self.camera.map(ViewCamera::to_wire),
             ..pb::LocalizeRequest::default()
         };
 
         let answer = self.server.connect().await?.localize(request).await?;
+        if let Some(pose) = &answer.pose {
+            say(estimate_text(pose, answer.method()));
+        }
+        if !answer.reason.is_empty() {
+            say(&answer.reason);
+        }
+        if let Some(matches) = &answer.matches {
+            say(matches_text(matches));
+        }
+        if let Some(fitted) = &answer.fitted {
+            say(fitted_text(fitted));
+        }
+
+        let novelty = match answer.novelty {
+            Some(novelty) => format!("novelty {novelty:.2}, in the map up to 1"),
+            None => "novelty unknown".to_owned(),
+        };
+        let adapter = match &answer.adapter {
+            Some(adapter) => format!("adapter {}", revision(Some(adapter))),
+            None => "no adapter".to_owned(),
+        };
         say(format_args!(
-            "adapter {}, {} rooms",
-            revision(answer.adapter.as_ref()),
+            "room {}, {novelty}; {adapter}, {} rooms searched",
+            revision(answer.room.as_ref()),
             answer.room_count
         ));
-
-        if let Some(believed) = &answer.believed {
-            say(believed_text(believed));
-        }
-        if let Some(located) = &answer.located {
-            say(located_text(located));
-        }
 
         // Only a view that is a frame of the room has a recorded pose, and hence an error.
         for place in &answer.places {
@@ -76,39 +97,4 @@ impl Localize {
 
         self.json.write(&wire_json("LocalizeResponse", &answer)?)
     }
-}
-
-/// The estimated camera pose, and whether the view resembles the room.
-fn believed_text(believed: &pb::BelievedPose) -> String {
-    let pose = pose_text(believed.pose.as_ref());
-    let sure = deviations_text(&believed.covariance);
-
-    match believed.out_of_distribution {
-        None => format!(
-            "camera at {pose}{sure}; the view's distance from the room is unknown: the adapter is not calibrated"
-        ),
-        Some(far) if far > 1.0 => format!(
-            "the view is out of distribution, at {far:.2} of the room's limit (above 1): the camera pose is \
-             unknown"
-        ),
-        Some(far) => {
-            format!("camera at {pose}{sure}; the view's distance is {far:.2} of the room's limit")
-        }
-    }
-}
-
-/// The pose from the adapter fitted to the room, with the sources of its translation and rotation.
-fn located_text(located: &pb::LocatedPose) -> String {
-    format!(
-        "the adapter fitted to the room: camera at {}{}\n\
-         from frame {}, distance {:.3}: translation {} × {:.1}, rotation {} × {:.1}",
-        pose_text(located.pose.as_ref()),
-        deviations_text(&located.covariance),
-        located.frame_id,
-        located.distance,
-        located.translation_reader,
-        located.translation_gain,
-        located.rotation_reader,
-        located.rotation_gain
-    )
 }

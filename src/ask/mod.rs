@@ -17,14 +17,17 @@ pub use relocalize::Relocalize;
 pub use wire_json::wire_json;
 
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
 use clap::Args;
 
+use crate::camera::CameraOption;
 use seese3_client::proto::v1 as pb;
 use seese3_client::{Client, ClientTls, ConnectOptions};
 use seese3_data::datasets::read_features;
+use seese3_server::camera_to_wire;
 
 #[derive(Debug, Args)]
 pub struct Server {
@@ -113,6 +116,81 @@ impl FeatureRow {
             _ => bail!(missing),
         }
     }
+}
+
+/// The camera of the images of a request.
+#[derive(Debug, Clone, Copy)]
+enum ViewCamera {
+    Stated(CameraOption),
+    Mapping,
+}
+
+impl FromStr for ViewCamera {
+    type Err = anyhow::Error;
+
+    fn from_str(text: &str) -> anyhow::Result<Self> {
+        match text {
+            "mapping" => Ok(Self::Mapping),
+            stated => Ok(Self::Stated(stated.parse()?)),
+        }
+    }
+}
+
+impl ViewCamera {
+    fn to_wire(self) -> pb::ViewCamera {
+        use pb::view_camera::Camera;
+
+        let camera = match self {
+            Self::Stated(CameraOption(camera)) => Camera::Intrinsics(camera_to_wire(&camera)),
+            Self::Mapping => Camera::MappingCamera(true),
+        };
+        pb::ViewCamera {
+            camera: Some(camera),
+        }
+    }
+}
+
+/// The method of a pose in words.
+fn method_text(method: pb::LocalizationMethod) -> &'static str {
+    match method {
+        pb::LocalizationMethod::Unspecified => "no pose",
+        pb::LocalizationMethod::MatchedKeypoints => "matched keypoints",
+        pb::LocalizationMethod::FittedAdapter => "fitted adapter",
+        pb::LocalizationMethod::SimilarFrames => "similar frames",
+        pb::LocalizationMethod::NearestFrame => "nearest frame",
+        pb::LocalizationMethod::Recorded => "recorded",
+    }
+}
+
+/// A pose with its standard deviations and the method that gave it.
+fn estimate_text(pose: &pb::PoseWithCovariance, method: pb::LocalizationMethod) -> String {
+    format!(
+        "camera at {}{} ({})",
+        pose_text(pose.pose.as_ref()),
+        deviations_text(&pose.covariance),
+        method_text(method)
+    )
+}
+
+fn matches_text(matches: &pb::KeypointMatches) -> String {
+    format!(
+        "{} of {} keypoints agree with {} frames",
+        matches.inliers,
+        matches.keypoints,
+        matches.frame_ids.len()
+    )
+}
+
+fn fitted_text(fitted: &pb::FittedEstimate) -> String {
+    format!(
+        "from frame {}, distance {:.3}: translation {} × {:.1}, rotation {} × {:.1}",
+        fitted.frame_id,
+        fitted.distance,
+        fitted.translation_reader,
+        fitted.translation_gain,
+        fitted.rotation_reader,
+        fitted.rotation_gain
+    )
 }
 
 fn feature_view(file: &Path, row: usize) -> anyhow::Result<pb::View> {

@@ -5,7 +5,10 @@ use std::path::PathBuf;
 use anyhow::bail;
 use clap::Args;
 
-use super::{Server, deviations_text, feature_view, image_view, pose_text, revision, wire_json};
+use super::{
+    Server, ViewCamera, estimate_text, feature_view, image_view, matches_text, revision, wire_json,
+};
+use crate::camera::CAMERA_FORM;
 use crate::output::{JsonOutput, say};
 use seese3_client::proto::v1 as pb;
 
@@ -28,6 +31,10 @@ pub struct Relocalize {
         conflicts_with = "features"
     )]
     images: Vec<PathBuf>,
+    /// Camera of --images, as --camera of `seese3 import`, or "mapping" for the camera that mapped the
+    /// room. Required if a room has keypoints
+    #[arg(long, value_name = CAMERA_FORM, requires = "images")]
+    camera: Option<ViewCamera>,
     /// A NumPy file of features, shape (n, d); --rows chooses some
     #[arg(long, value_name = "FILE", requires = "rows")]
     features: Option<PathBuf>,
@@ -72,12 +79,12 @@ impl Relocalize {
             views,
             max_rooms: Some(self.max_rooms),
             top_k: None,
+            camera: self.camera.map(ViewCamera::to_wire),
         };
         let answer = self.server.connect().await?.relocalize(request).await?;
 
         say(format_args!(
-            "adapter {}, {} rooms searched: {}",
-            revision(answer.adapter.as_ref()),
+            "{} rooms searched: {}",
             answer.room_count,
             match answer.ambiguous {
                 true => format!("ambiguous, {}", answer.reason),
@@ -85,13 +92,18 @@ impl Relocalize {
             }
         ));
         for found in &answer.rooms {
-            say(format_args!(
-                "room {}: distance {:.2} of its limit, camera at {}{}",
-                revision(found.room.as_ref()),
-                found.out_of_distribution,
-                pose_text(found.pose.as_ref()),
-                deviations_text(&found.covariance)
-            ));
+            let mut text = format!("room {}: ", revision(found.room.as_ref()));
+            match &found.pose {
+                Some(pose) => text += &estimate_text(pose, found.method()),
+                None => text += "the view is not in it",
+            }
+            if let Some(matches) = &found.matches {
+                text += &format!("; {}", matches_text(matches));
+            }
+            if let Some(ratio) = found.distance_ratio {
+                text += &format!("; distance {ratio:.2} of its limit");
+            }
+            say(text);
         }
 
         self.json.write(&wire_json("RelocalizeResponse", &answer)?)

@@ -183,12 +183,14 @@ class AsyncClient:
         max_recoveries: int | None = None,
         planner: str | None = None,
         least_arrival_probability: float | None = None,
+        camera: Camera | str | None = None,
         on_step: Callable[[answers.WayStep], None] | None = None,
         deadline_s: float | None = None,
     ) -> answers.Way:
         """Plans a way from `source` to a stored frame or a pose (4, 4). `planner` is "pose_graph" or "latent".
 
-        `on_step` is called with every step as it arrives; the way that is returned has them all.
+        `on_step` is called with every step as it arrives; the way that is returned has them all. `camera` is that of
+        an image, or "mapping"; with it, the start is estimated from matched keypoints if the room has any.
         """
         if (goal is None) == (goal_pose is None):
             raise ValueError("give exactly one of goal (a frame's row) and goal_pose")
@@ -206,6 +208,7 @@ class AsyncClient:
             max_recoveries=requests.count(max_recoveries, "max_recoveries"),
             planner=requests.enum_value(navigation_pb2.Planner, "PLANNER_", planner, "planner"),  # type: ignore[arg-type]
             least_arrival_probability=least_arrival_probability,
+            source_camera=requests.wire_view_camera(camera),
         )
         call = self._navigation.NavigateTo(request, timeout=self._timeout(deadline_s), metadata=self._metadata)
 
@@ -228,15 +231,21 @@ class AsyncClient:
         adapter: str = "",
         top_k: int | None = None,
         thresholds: Sequence[float] = (),
+        camera: Camera | str | None = None,
         deadline_s: float | None = None,
     ) -> answers.Localization:
-        """Retrieves the stored frames that look most like a view, in one room, in several, or in all: ()."""
+        """Estimates the pose of a view in one room, in several, or in all: ().
+
+        `camera` is that of an image, or "mapping" for the camera that mapped the room. It is required if the room has
+        keypoints.
+        """
         request = localization_pb2.LocalizeRequest(
             rooms=requests.names(rooms),
             adapter=adapter,
             view=wire_view(view),
             top_k=requests.count(top_k, "top_k"),
             thresholds=thresholds,
+            camera=requests.wire_view_camera(camera),
         )
         return answers.Localization.of(await self._ask(self._localization.Localize, request, deadline_s))
 
@@ -248,15 +257,21 @@ class AsyncClient:
         adapter: str = "",
         max_rooms: int | None = None,
         top_k: int | None = None,
+        camera: Camera | str | None = None,
         deadline_s: float | None = None,
     ) -> answers.Relocalization:
-        """Says in which room a camera is, where in it, and how sure that is, from some views, the newest last."""
+        """Finds the room of a camera and its pose there, from some views, the newest last.
+
+        `camera` is that of the images, or "mapping" for the camera that mapped the room. It is required if a room has
+        keypoints.
+        """
         request = localization_pb2.RelocalizeRequest(
             rooms=requests.names(rooms),
             adapter=adapter,
             views=requests.wire_views(views),
             max_rooms=requests.count(max_rooms, "max_rooms"),
             top_k=requests.count(top_k, "top_k"),
+            camera=requests.wire_view_camera(camera),
         )
         return answers.Relocalization.of(await self._ask(self._localization.Relocalize, request, deadline_s))
 

@@ -352,11 +352,29 @@ class Default:
 
 
 @dataclass(frozen=True, eq=False)
-class LocatedPose:
-    """Where the adapter that was fitted to the room says a view is: world_from_camera with its covariance."""
+class KeypointMatches:
+    """The matches of a view's keypoints with those of a room.
 
-    pose: Array
-    covariance: Array | None
+    `inliers` of the view's `keypoints` agree with the pose; `frame_ids` are the stored frames with agreeing keypoints.
+    """
+
+    inliers: int
+    keypoints: int
+    frame_ids: tuple[int, ...]
+
+    @classmethod
+    def of(cls, message: Any) -> KeypointMatches | None:
+        if not message.HasField("matches"):
+            return None
+        matches = message.matches
+        return cls(matches.inliers, matches.keypoints, tuple(matches.frame_ids))
+
+
+@dataclass(frozen=True, eq=False)
+class FittedEstimate:
+    """Details of a pose by the adapter that is fitted to the room: the nearest frame, and the gains of the motion
+    from it to the view."""
+
     frame_id: int
     distance: float
     translation_reader: str
@@ -365,20 +383,10 @@ class LocatedPose:
     rotation_gain: float
 
     @classmethod
-    def of(cls, message: Any, field: str) -> LocatedPose | None:
-        if not message.HasField(field):
+    def of(cls, message: Any) -> FittedEstimate | None:
+        if not message.HasField("fitted"):
             return None
-        located = getattr(message, field)
-        return cls(
-            pose_matrix(located.pose),
-            covariance_matrix(located.covariance),
-            located.frame_id,
-            located.distance,
-            located.translation_reader,
-            located.translation_gain,
-            located.rotation_reader,
-            located.rotation_gain,
-        )
+        return cls(**{name: getattr(message.fitted, name) for name in cls.__dataclass_fields__})
 
 
 @dataclass(frozen=True, eq=False)
@@ -391,25 +399,26 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class BelievedPose:
-    """Where a view is believed to be, world_from_camera. `out_of_distribution` above 1: it looks like another place,
-    and the pose means nothing; None under an adapter that is not calibrated."""
-
-    pose: Array
-    covariance: Array | None
-    out_of_distribution: float | None
-
-
-@dataclass(frozen=True, eq=False)
 class Localization:
-    """Which stored frames look most like a view, the best first. `believed` is there if one room was searched: the pose
-    to use, and how sure it is; `located` is what the adapter fitted to the room says by itself."""
+    """The estimated pose of a view, world_from_camera (4, 4), in the world frame of `room`.
 
-    adapter: Revision
+    `pose` is None if the view is not in the map; `reason` then states why. `covariance` (6, 6) is in ROS order: x, y,
+    z, and rotations about the axes of the world frame; None if the errors of the method were not measured. `novelty`
+    above 1 means not in the map. `method` is "matched_keypoints", "fitted_adapter", "similar_frames", "nearest_frame"
+    or "recorded"; None without a pose. `places` are the stored frames most similar to the view, the best first.
+    """
+
+    pose: Array | None
+    covariance: Array | None
+    room: Revision
+    novelty: float | None
+    method: str | None
+    reason: str | None
+    matches: KeypointMatches | None
+    fitted: FittedEstimate | None
     places: tuple[Place, ...]
+    adapter: Revision | None
     room_count: int
-    located: LocatedPose | None
-    believed: BelievedPose | None
 
     @classmethod
     def of(cls, message: localization_pb2.LocalizeResponse) -> Localization:
@@ -417,37 +426,61 @@ class Localization:
             Place(Revision.of(place.room), Frame.of(place.frame), PoseError.of(place, "error"))
             for place in message.places
         )
-        believed = None
-        if message.HasField("believed"):
-            wire = message.believed
-            far = _known(wire, "out_of_distribution")
-            believed = BelievedPose(pose_matrix(wire.pose), covariance_matrix(wire.covariance), far)
-        located = LocatedPose.of(message, "located")
-        return cls(Revision.of(message.adapter), places, message.room_count, located, believed)
+        return cls(
+            *_pose_with_covariance(message),
+            Revision.of(message.room),
+            _known(message, "novelty"),
+            _method(message.method),
+            message.reason or None,
+            KeypointMatches.of(message),
+            FittedEstimate.of(message),
+            places,
+            Revision.of(message.adapter) if message.HasField("adapter") else None,
+            message.room_count,
+        )
+
+
+def _pose_with_covariance(message: Any) -> tuple[Array | None, Array | None]:
+    if not message.HasField("pose"):
+        return None, None
+    return pose_matrix(message.pose.pose), covariance_matrix(message.pose.covariance)
+
+
+def _method(value: int) -> str | None:
+    if value == localization_pb2.LOCALIZATION_METHOD_UNSPECIFIED:
+        return None
+    return _word(localization_pb2.LocalizationMethod, value, "LOCALIZATION_METHOD_")
 
 
 @dataclass(frozen=True, eq=False)
 class RoomMatch:
-    """How well views match one room. `out_of_distribution` above 1: they look like another place."""
+    """How well views match one room. `pose`, `covariance`, `novelty`, `method`, `matches` and `fitted` are those of
+    the newest view, as in Localization. `distance` and `distance_ratio` compare the latents of all views with the
+    room; a ratio above 1 means that they look like another place. Both are None without an adapter."""
 
     room: Revision
-    distance: float
-    out_of_distribution: float
-    pose: Array
+    pose: Array | None
     covariance: Array | None
+    novelty: float | None
+    method: str | None
+    matches: KeypointMatches | None
+    fitted: FittedEstimate | None
+    distance: float | None
+    distance_ratio: float | None
     frames: tuple[Frame, ...]
-    located: LocatedPose | None
 
     @classmethod
     def of(cls, message: localization_pb2.RoomMatch) -> RoomMatch:
         return cls(
             Revision.of(message.room),
-            message.distance,
-            message.out_of_distribution,
-            pose_matrix(message.pose),
-            covariance_matrix(message.covariance),
+            *_pose_with_covariance(message),
+            _known(message, "novelty"),
+            _method(message.method),
+            KeypointMatches.of(message),
+            FittedEstimate.of(message),
+            _known(message, "distance"),
+            _known(message, "distance_ratio"),
             tuple(map(Frame.of, message.frames)),
-            LocatedPose.of(message, "located"),
         )
 
 
@@ -455,7 +488,7 @@ class RoomMatch:
 class Relocalization:
     """In which room, and where in it, a camera is. If `ambiguous`, `reason` says why not to rely on it."""
 
-    adapter: Revision
+    adapter: Revision | None
     rooms: tuple[RoomMatch, ...]
     room_count: int
     margin: float | None
@@ -465,7 +498,7 @@ class Relocalization:
     @classmethod
     def of(cls, message: localization_pb2.RelocalizeResponse) -> Relocalization:
         return cls(
-            Revision.of(message.adapter),
+            Revision.of(message.adapter) if message.HasField("adapter") else None,
             tuple(map(RoomMatch.of, message.rooms)),
             message.room_count,
             _known(message, "margin"),

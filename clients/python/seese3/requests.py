@@ -74,6 +74,17 @@ def wire_camera(camera: Camera | None) -> geometry_pb2.CameraIntrinsics | None:
     )
 
 
+def wire_view_camera(camera: Camera | str | None) -> geometry_pb2.ViewCamera | None:
+    """The camera of a request's images: stated, or "mapping" for the camera that mapped the room."""
+    if camera is None:
+        return None
+    if isinstance(camera, str):
+        if camera != "mapping":
+            raise ValueError(f'camera: must be a Camera or "mapping", got {camera!r}')
+        return geometry_pb2.ViewCamera(mapping_camera=True)
+    return geometry_pb2.ViewCamera(intrinsics=wire_camera(camera))
+
+
 def displacement(
     to: int | None, twist: npt.ArrayLike | None, pose: npt.ArrayLike | None
 ) -> navigation_pb2.Displacement:

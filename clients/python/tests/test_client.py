@@ -75,16 +75,22 @@ def test_localization_of_features_and_images(client: seese3.Client, drawn: Path)
         found = client.localize(view, rooms=ROOM, top_k=3)
         assert found.places[0].frame.id == 33 and len(found.places) == 3
         # A mapped view lies within the room's limit, and its pose is known to some centimetres.
-        assert found.believed is not None and found.believed.out_of_distribution is not None
-        assert found.believed.out_of_distribution < 1
-        assert np.linalg.norm(found.believed.pose[:3, 3] - room.poses[33][:3, 3]) < 0.05
-        assert found.believed.covariance is not None and found.believed.covariance.shape == (6, 6)
+        assert found.pose is not None and found.novelty is not None and found.novelty < 1
+        assert found.room.name == ROOM and found.method in ("fitted_adapter", "similar_frames")
+        assert np.linalg.norm(found.pose[:3, 3] - room.poses[33][:3, 3]) < 0.05
+        assert found.covariance is not None and found.covariance.shape == (6, 6)
 
     # A feature with its columns in another order is that of no image, though some frame is nearest.
     strange = client.localize(room.features[FEATURES][33][::-1], rooms=ROOM)
-    assert strange.believed is not None and strange.believed.out_of_distribution is not None
-    assert strange.believed.out_of_distribution > 1 and len(strange.places) == 1
-    assert client.localize(33, rooms=ROOM).believed is None
+    assert strange.pose is None and strange.method is None and len(strange.places) == 1
+    assert strange.novelty is not None and strange.novelty > 1
+    assert strange.reason is not None and "not in the map" in strange.reason
+
+    stored = client.localize(33, rooms=ROOM)
+    assert stored.method == "recorded" and stored.pose is not None
+    np.testing.assert_allclose(stored.pose, room.poses[33], atol=1e-9)
+    with pytest.raises(ValueError, match="must be a Camera or"):
+        client.localize(room.images[33], rooms=ROOM, camera="other")
 
     views = list(room.features[FEATURES][30:34])
     placed = client.relocalize(views)

@@ -22,6 +22,23 @@ pub struct KeypointSource {
     pub model_file: String,
 }
 
+impl KeypointSource {
+    /// Whether keypoints of both sources can be matched: the same encoder, preparation and outputs.
+    /// The path of the model's file does not matter.
+    pub fn is_like(&self, other: &Self) -> bool {
+        let outputs = |source: &Self| {
+            let Self {
+                positions,
+                reliability,
+                descriptors,
+                ..
+            } = source;
+            [positions, reliability, descriptors].map(Clone::clone)
+        };
+        self.feature.is_like(&other.feature) && outputs(self) == outputs(other)
+    }
+}
+
 /// Maximum number of keypoints of an image.
 pub const MAX_KEYPOINTS: usize = 600;
 

@@ -10,7 +10,8 @@ use super::metrics::Metrics;
 use super::{Error, RunError};
 use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
-use seese3_encoder::{Bounds, Encoder, Runtime, decode};
+use seese3_core::keypoints::KeypointSource;
+use seese3_encoder::{Bounds, EncodedFrame, Encoder, Runtime, decode};
 use seese3_store::StoredAdapter;
 
 /// Configuration of the image encoders.
@@ -75,17 +76,25 @@ impl ImageEncoder {
     /// # Errors
     /// As [`ImageEncoder::feature`].
     pub fn feature_of(&self, field: &str, image: RgbImage) -> Result<Vec<f32>, Error> {
+        Ok(self.frame_of(field, image)?.feature)
+    }
+
+    /// The feature of decoded pixels and, with an encoder of keypoints, their keypoints.
+    ///
+    /// # Errors
+    /// As [`ImageEncoder::feature`].
+    pub fn frame_of(&self, field: &str, image: RgbImage) -> Result<EncodedFrame, Error> {
         let began = Instant::now();
-        let rows = self
+        let frames = self
             .encoder
             .prepare(image)
-            .and_then(|image| self.encoder.encode(&[vec![&image]]));
+            .and_then(|image| self.encoder.encode_frames(&[vec![&image]]));
 
         if let Some(metrics) = &self.metrics {
             metrics.image_encoded(began.elapsed());
         }
-        rows.map(|rows| rows.row(0).to_vec())
-            .map_err(|error| request_error(field, error))
+        let mut frames = frames.map_err(|error| request_error(field, error))?;
+        frames.pop().ok_or(Error::Internal)
     }
 }
 
@@ -116,8 +125,13 @@ pub fn check_models(models: &[String]) -> Result<(), RunError> {
     Ok(())
 }
 
-/// Warns about models that no adapter uses: probably a configuration mistake.
-pub fn warn_of_unneeded(models: &[String], adapters: &BTreeMap<String, Arc<StoredAdapter>>) {
+/// Warns about models that make neither an adapter's features nor a room's keypoints: probably a
+/// configuration mistake.
+pub fn warn_of_unneeded<'a>(
+    models: &[String],
+    adapters: &BTreeMap<String, Arc<StoredAdapter>>,
+    keypoints: impl Iterator<Item = &'a KeypointSource> + Clone,
+) {
     for model in models {
         // `check_models` has reported unreadable models.
         let Ok(id) = seese3_encoder::identity(model) else {
@@ -126,9 +140,14 @@ pub fn warn_of_unneeded(models: &[String], adapters: &BTreeMap<String, Arc<Store
 
         let is_needed = adapters
             .values()
-            .any(|adapter| adapter.adapter.source().encoder == id);
+            .any(|adapter| adapter.adapter.source().encoder == id)
+            || keypoints.clone().any(|source| source.feature.encoder == id);
         if !is_needed {
-            tracing::warn!(model, id, "no adapter uses this encoder");
+            tracing::warn!(
+                model,
+                id,
+                "no adapter and no room's keypoints use this encoder"
+            );
         }
     }
 }

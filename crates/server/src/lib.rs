@@ -29,6 +29,7 @@ mod traces;
 mod metrics;
 mod connections;
 mod image_encoder;
+mod image_view;
 mod request_metrics;
 mod operations;
 mod workers;

@@ -14,6 +14,8 @@ use tonic::Status;
 use tracing::Instrument;
 
 use super::convert;
+use super::image_view::{ImageView, ViewFields, contradicted};
+use super::localization::localizer;
 use super::snapshot::{ServedNavigator, Snapshot};
 use super::status::view_error;
 use super::workers::Lane;
@@ -28,11 +30,12 @@ use seese3_core::navigation::{
     Error as E, Feedback, Navigator, Outcome, Pursuit, Source, Start, Stepper, pursue,
 };
 use seese3_core::room::FrameId;
+use seese3_robot::localization::{LocatedView, NotLocated, PoseEstimate};
 use seese3_robot::planning::{
-    BelievedStart, Hops, KnownRoom, LEAST_ARRIVAL_PROBABILITY, NoRoute, Planned, Route,
-    RouteBounds, StartUnknown, plan,
+    BelievedStart, Hops, LEAST_ARRIVAL_PROBABILITY, NoRoute, Planned, Route, RouteBounds,
+    StartUnknown, plan,
 };
-use seese3_robot::tracking::{PoseReader, PoseWithCovariance};
+use seese3_robot::tracking::{MapQuery, PoseWithCovariance};
 
 /// Stream of feedback events and the final result.
 pub type Events = Pin<Box<dyn Stream<Item = Result<pb::NavigateToResponse, Status>> + Send>>;
@@ -221,6 +224,7 @@ fn ready(
         max_recoveries,
         planner,
         least_arrival_probability,
+        source_camera,
     } = request;
 
     let least_arrival_probability = least_probability(least_arrival_probability)?;
@@ -230,7 +234,36 @@ fn ready(
 
     let served = snapshot.navigator(&room, &adapter)?;
     let navigator = &served.navigator;
-    let source = convert::source("source", source, &served.adapter, snapshot)?;
+    let is_image = matches!(
+        &source,
+        Some(pb::View {
+            view: Some(pb::view::View::Image(_))
+        })
+    );
+    let image = match (&source_camera, is_image, &source_pose) {
+        (Some(camera), true, None) => {
+            let fields = ViewFields {
+                view: "source",
+                camera: "source_camera",
+            };
+            let room = std::slice::from_ref(snapshot.room(&room)?);
+            ImageView::of(snapshot, fields, source.as_ref(), Some(camera), room)?
+        }
+        _ => None,
+    };
+    let tried = match &image {
+        Some(image) => {
+            let room = std::slice::from_ref(snapshot.room(&room)?);
+            image.matched(room, &Cancellation::default())?.pop()
+        }
+        None => None,
+    };
+
+    let known = image.as_ref();
+    let source = match known.and_then(|image| image.feature_for(&served.adapter)) {
+        Some(feature) => Source::Feature(feature),
+        None => convert::source("source", source, &served.adapter, snapshot)?,
+    };
     let pose = source_pose
         .map(|pose| convert::pose(pose, &room))
         .transpose();
@@ -251,7 +284,13 @@ fn ready(
             other => Error::from(other),
         })?;
 
-    let start = believed_start(&served, &source, &view);
+    let tried = tried.map(|tried| tried.found);
+    if let Some(Err(why)) = &tried
+        && let Some(error) = contradicted("source_camera", Some(why))
+    {
+        return Err(error);
+    }
+    let start = believed_start(&served, &source, &view, tried)?;
     view.pose = Some(start.pose);
 
     let goal = goal_pose(goal, navigator, &room)?;
@@ -281,22 +320,34 @@ fn ready(
     })
 }
 
-/// The start pose: recorded or given by the caller, else estimated from the view.
-fn believed_start(served: &ServedNavigator, source: &Source, view: &Start) -> BelievedStart {
-    let reader = served.room_reader().map(|reader| reader as &dyn PoseReader);
-    let room = KnownRoom {
-        navigator: &served.navigator,
-        map: served.map.as_deref(),
-        reader,
+/// The start pose: recorded or given by the caller, else estimated from the view. `tried` is the
+/// match of its keypoints, if they were tried.
+fn believed_start(
+    served: &ServedNavigator,
+    source: &Source,
+    view: &Start,
+    tried: Option<Result<LocatedView, NotLocated>>,
+) -> Result<BelievedStart, Error> {
+    let query = MapQuery {
+        latent: view.latent.view(),
+        feature: match source {
+            Source::Feature(feature) => Some(feature),
+            Source::Frame(_) | Source::Latent(_) => None,
+        },
     };
 
-    match (source, view.pose) {
-        (Source::Frame(_), Some(pose)) => BelievedStart::recorded(pose),
-        (_, Some(pose)) => BelievedStart::given(pose, room, view.latent.view()),
-        (Source::Feature(feature), None) => {
-            BelievedStart::seen(room, view.latent.view(), Some(feature))
+    match (source, view.pose, tried) {
+        (Source::Frame(_), Some(pose), _) => Ok(BelievedStart::recorded(pose)),
+        (_, Some(pose), _) => Ok(BelievedStart::given(pose, served.map.as_deref(), query)),
+        (_, None, Some(Ok(located))) => {
+            let seen = BelievedStart::seen(Ok(PoseEstimate::matched(located)));
+            seen.ok_or(Error::Internal)
         }
-        (_, None) => BelievedStart::seen(room, view.latent.view(), None),
+        (_, None, tried) => {
+            let why = tried.and_then(Result::err);
+            let estimate = localizer(served).locate_by_similarity(Some(query), why);
+            BelievedStart::seen(estimate).ok_or(Error::Internal)
+        }
     }
 }
 

@@ -1,20 +1,26 @@
 //! LocalizationService.Relocalize: finds a camera's room and its pose there without a prior. Also
 //! selects the rooms and maps for Track.
 
+use std::cmp::Reverse;
 use std::sync::Arc;
 
 use tonic::{Request, Response, Status};
 
 use super::convert;
 use super::embedding::{EmbeddedView, StoredFrames, ViewEmbedder};
-use super::localization::{located_by, rooms_under};
+use super::image_view::{ImageView, RoomTried, ViewFields, contradicted};
+use super::localization::{self, LocatedPose, asked_rooms, localizer, rooms_under};
 use super::snapshot::{ServedNavigator, ServedRoom, Snapshot};
 use super::workers::Lane;
 use super::{Error, Handlers};
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
 use seese3_core::navigation::RetrievedFrame;
-use seese3_robot::tracking::{self, Map, MapQuery, RoomMatch, relocalize};
+use seese3_core::room::RoomId;
+use seese3_robot::localization::{LocatedView, NotLocated, PoseEstimate, RoomLocalizer};
+use seese3_robot::tracking::{
+    self, Map, MapQuery, ROOM_RATIO, Relocalization, RoomMatch, relocalize,
+};
 use seese3_store::StoredAdapter;
 
 /// Default number of rooms in an answer.
@@ -50,6 +56,7 @@ fn answer(
         views,
         max_rooms,
         top_k,
+        camera,
     } = request;
 
     let within = |field: &str, given: Option<u32>, plain: u32| match given.unwrap_or(plain) {
@@ -71,34 +78,186 @@ fn answer(
         ));
     }
 
-    let served = rooms_to_track_in(snapshot, &rooms, &adapter)?;
+    // The keypoints of the newest view need no adapter.
+    let asked = asked_rooms(snapshot, &rooms)?;
+    let newest_field = format!("views[{}]", views.len() - 1);
+    let fields = ViewFields {
+        view: &newest_field,
+        camera: "camera",
+    };
+    let image = ImageView::of(snapshot, fields, views.last(), camera.as_ref(), &asked)?;
+    let tried = match &image {
+        Some(image) => image.matched(&asked, cancel)?,
+        None => Vec::new(),
+    };
+
+    let by_latent = match rooms_with_maps(snapshot, &rooms, &adapter) {
+        Err(_) if adapter.is_empty() && image.is_some() => None,
+        served => Some(ByLatent::of(served?, views, top_k, snapshot, cancel)?),
+    };
+    ranked(tried, by_latent.as_ref(), shown)
+}
+
+fn rooms_with_maps(
+    snapshot: &Snapshot,
+    rooms: &[String],
+    adapter: &str,
+) -> Result<(Vec<Arc<ServedNavigator>>, Vec<Arc<Map>>), Error> {
+    let served = rooms_to_track_in(snapshot, rooms, adapter)?;
     let maps = maps(&served)?;
-    let stored = &served[0].adapter;
-    let views = embedded(views, stored, snapshot, cancel)?;
-    let queries: Vec<MapQuery<'_>> = views
-        .iter()
-        .map(|view| MapQuery {
-            latent: view.latent.view(),
-            feature: view.feature.as_deref(),
+    Ok((served, maps))
+}
+
+/// The rooms compared by the latents of the views.
+struct ByLatent {
+    served: Vec<Arc<ServedNavigator>>,
+    found: Relocalization,
+    newest: EmbeddedView,
+}
+
+impl ByLatent {
+    fn of(
+        (served, maps): (Vec<Arc<ServedNavigator>>, Vec<Arc<Map>>),
+        views: Vec<pb::View>,
+        top_k: usize,
+        snapshot: &Snapshot,
+        cancel: &Cancellation,
+    ) -> Result<Self, Error> {
+        let mut views = embedded(views, &served[0].adapter, snapshot, cancel)?;
+        let queries: Vec<MapQuery<'_>> = views.iter().map(query_of).collect();
+        let found = relocalize(&maps, &queries, top_k, cancel).map_err(|error| match error {
+            tracking::Error::Cancelled => Error::Cancelled,
+            _ => Error::Internal,
+        })?;
+
+        let newest = views.pop().ok_or(Error::Internal)?;
+        Ok(Self {
+            served,
+            found,
+            newest,
         })
-        .collect();
-    let found = relocalize(&maps, &queries, top_k, cancel).map_err(|error| match error {
-        tracking::Error::Cancelled => Error::Cancelled,
-        _ => Error::Internal,
-    })?;
+    }
+}
 
-    let newest = views.last().and_then(|view| view.feature.as_deref());
-    let shown = found.rooms.iter().take(shown);
-    let rooms = shown.map(|room| room_to_wire(room, &served, newest));
+fn query_of(view: &EmbeddedView) -> MapQuery<'_> {
+    MapQuery {
+        latent: view.latent.view(),
+        feature: view.feature.as_deref(),
+    }
+}
 
+/// Ranks the rooms: first those in which the keypoints of the newest view give a pose, by their
+/// inliers, then the others by the distance of latents.
+fn ranked(
+    tried: Vec<RoomTried>,
+    by_latent: Option<&ByLatent>,
+    shown: usize,
+) -> Result<pb::RelocalizeResponse, Error> {
+    let was_tried: Vec<RoomId> = tried.iter().map(|tried| tried.room.id.clone()).collect();
+    let mut located: Vec<(Arc<ServedRoom>, LocatedView)> = Vec::new();
+    let mut unmatched = Vec::new();
+    for RoomTried { room, found } in tried {
+        match found {
+            Ok(view) => located.push((room, view)),
+            Err(why) => unmatched.push((room, why)),
+        }
+    }
+    located.sort_by_key(|(_, view)| Reverse(view.inliers));
+    if located.is_empty() {
+        let contradicted = |(_, why): &(_, _)| contradicted("camera", Some(why));
+        if let Some(error) = unmatched.iter().find_map(contradicted) {
+            return Err(error);
+        }
+    }
+
+    let mut rooms: Vec<pb::RoomMatch> = located.iter().map(located_to_wire).collect();
+    if let Some(ByLatent {
+        served,
+        found,
+        newest,
+    }) = by_latent
+    {
+        for room in &found.rooms {
+            let id = served[room.map].navigator.room().id();
+            let why = unmatched.iter().find(|(tried, _)| tried.id == *id);
+            let wire = room_to_wire(room, &served[room.map], newest, why.map(|(_, why)| *why))?;
+            match rooms.iter_mut().find(|known| known.room == wire.room) {
+                Some(known) => {
+                    known.distance = wire.distance;
+                    known.distance_ratio = wire.distance_ratio;
+                    known.frames = wire.frames;
+                }
+                None => rooms.push(wire),
+            }
+        }
+    }
+    unmatched.sort_by(|(_, a), (_, b)| a.novelty().total_cmp(&b.novelty()));
+    for (room, why) in &unmatched {
+        let name = room.id.as_str();
+        let is_known =
+            |known: &pb::RoomMatch| known.room.as_ref().is_some_and(|known| known.name == name);
+        if !rooms.iter().any(is_known) {
+            let nowhere = RoomLocalizer::default().locate_by_similarity(None, Some(*why));
+            let nowhere = LocatedPose::of(nowhere, name);
+            rooms.push(match_to_wire(localization::room_to_wire(room), nowhere));
+        }
+    }
+
+    let verdict = verdict(&located, by_latent, &was_tried);
+    let room_count = rooms.len() as u32;
+    rooms.truncate(shown);
     Ok(pb::RelocalizeResponse {
-        adapter: Some(convert::adapter_revision(&served[0])),
-        rooms: rooms.collect::<Result<_, _>>()?,
-        room_count: served.len() as u32,
-        margin: found.margin.is_finite().then_some(found.margin),
-        ambiguous: found.ambiguous,
-        reason: found.reason,
+        adapter: by_latent.map(|found| convert::adapter_revision(&found.served[0])),
+        rooms,
+        room_count,
+        margin: verdict.margin,
+        ambiguous: !verdict.reason.is_empty(),
+        reason: verdict.reason,
     })
+}
+
+struct Verdict {
+    margin: Option<f64>,
+    /// Why the best room is ambiguous; empty if it is not.
+    reason: String,
+}
+
+/// Whether the best room is clear. Latents alone are not enough for a room whose keypoints do not
+/// locate the newest view.
+fn verdict(
+    located: &[(Arc<ServedRoom>, LocatedView)],
+    by_latent: Option<&ByLatent>,
+    was_tried: &[RoomId],
+) -> Verdict {
+    let inliers = |place: usize| located.get(place).map(|(_, view)| view.inliers as f64);
+    if let Some(best) = inliers(0) {
+        let margin = inliers(1).map(|second| best / second);
+        let is_clear = margin.is_none_or(|margin| 1.0 / margin <= ROOM_RATIO);
+        let reason = if is_clear {
+            String::new()
+        } else {
+            "nearly as many keypoints agree with the second room".to_owned()
+        };
+        return Verdict { margin, reason };
+    }
+
+    let Some(ByLatent { served, found, .. }) = by_latent else {
+        return Verdict {
+            margin: None,
+            reason: "too few keypoints agree with any room".to_owned(),
+        };
+    };
+    let best = found.rooms.first();
+    let best = best.map(|room| served[room.map].navigator.room().id());
+    let reason = if best.is_some_and(|best| was_tried.contains(best)) && found.reason.is_empty() {
+        "too few keypoints agree with the most similar room".to_owned()
+    } else {
+        found.reason.clone()
+    };
+    Verdict {
+        margin: found.margin.is_finite().then_some(found.margin),
+        reason,
+    }
 }
 
 /// Embeds the views of a request. Checks for cancellation before each view, because encoding an
@@ -250,20 +409,45 @@ pub fn maps(served: &[Arc<ServedNavigator>]) -> Result<Vec<Arc<Map>>, Error> {
     served.iter().map(map).collect()
 }
 
-/// A room match as a wire message; `newest` is the raw feature of the newest view, if it has one.
+/// A room in which keypoints give a pose, as a wire message.
+fn located_to_wire((room, view): &(Arc<ServedRoom>, LocatedView)) -> pb::RoomMatch {
+    let estimate = PoseEstimate::matched(view.clone());
+    let located = LocatedPose::of(Ok(estimate), room.id.as_str());
+    match_to_wire(localization::room_to_wire(room), located)
+}
+
+fn match_to_wire(room: pb::Revision, located: LocatedPose) -> pb::RoomMatch {
+    let LocatedPose {
+        pose,
+        novelty,
+        method,
+        reason: _,
+        matches,
+        fitted,
+    } = located;
+    pb::RoomMatch {
+        room: Some(room),
+        pose,
+        novelty,
+        method: method.into(),
+        matches,
+        fitted,
+        ..Default::default()
+    }
+}
+
+/// A room compared by latents, as a wire message.
 fn room_to_wire(
     found: &RoomMatch,
-    served: &[Arc<ServedNavigator>],
-    newest: Option<&[f32]>,
+    served: &ServedNavigator,
+    newest: &EmbeddedView,
+    unmatched: Option<NotLocated>,
 ) -> Result<pb::RoomMatch, Error> {
-    let served = &served[found.map];
     let room = served.navigator.room();
-
-    // An adapter fitted to the room locates views better than the adapter that compares rooms.
-    let located = match (served.room_reader(), newest) {
-        (Some(reader), Some(feature)) => Some(located_by(reader, feature, room.id())?),
-        _ => None,
-    };
+    let query = query_of(newest);
+    let estimate = localizer(served).locate_by_similarity(Some(query), unmatched);
+    let mut located = LocatedPose::of(estimate, room.id().as_str());
+    located.add_fitted(served, query.feature)?;
 
     // Distances are in standard deviations of frame noise, unlike those of Localize.
     let retrieved = |neighbour: &seese3_core::index::Neighbour| {
@@ -273,31 +457,10 @@ fn room_to_wire(
         };
         convert::retrieved_to_wire(&retrieved, room)
     };
-
-    // Use the fitted adapter's pose if the views are in distribution. Otherwise use the anchor pose
-    // of the newest view.
-    let believed = located
-        .as_ref()
-        .filter(|_| found.out_of_distribution <= 1.0);
-    let (pose, covariance) = match believed {
-        Some(located) => (located.pose.clone(), located.covariance.clone()),
-        None => {
-            let anchor = &found.last.anchor.belief;
-            let pose = convert::pose_to_wire(&anchor.pose, room.id().as_str());
-            (
-                Some(pose),
-                convert::matrix_to_wire(&anchor.ros_covariance()),
-            )
-        }
-    };
-
     Ok(pb::RoomMatch {
-        room: Some(convert::room_revision(served)),
-        distance: found.distance,
-        out_of_distribution: found.out_of_distribution,
-        pose,
-        covariance,
+        distance: Some(found.distance),
+        distance_ratio: Some(found.out_of_distribution),
         frames: found.last.nearest.iter().map(retrieved).collect(),
-        located,
+        ..match_to_wire(convert::room_revision(served), located)
     })
 }

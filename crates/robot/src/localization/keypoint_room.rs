@@ -10,7 +10,8 @@
 use std::sync::Arc;
 
 use crate::matched_views::{
-    Candidates, FocalFit, KeypointMap, MatchedView, MatchingParameters, PlaceIndex, ViewKeypoints,
+    Candidates, FocalFit, KeypointMap, MappedKeypoints, MatchedView, MatchingParameters,
+    PlaceIndex, ViewKeypoints,
 };
 use crate::tracking::PoseWithCovariance;
 use seese3_core::geometry::{CameraIntrinsics, Pose};
@@ -35,6 +36,8 @@ pub struct LocatedView {
     pub pose: PoseWithCovariance,
     /// Number of the view's keypoints that agree with the pose.
     pub inliers: usize,
+    /// Number of the view's keypoints.
+    pub keypoints: usize,
     /// The largest ratio of a gate's limit to the view's value; at most 1. It is 1 for a view with
     /// the fewest accepted inliers, for example.
     pub novelty: f64,
@@ -66,7 +69,7 @@ pub enum NotLocated {
     },
     #[error(
         "the matches contradict the focal length of the view's camera: with {stated:.3} image widths {inliers} \
-         keypoints agree, with {fitted:.3} image widths {fitted_inliers}"
+         matches agree, with {fitted:.3} image widths {fitted_inliers}"
     )]
     CameraContradicted {
         /// Image widths.
@@ -110,6 +113,18 @@ impl KeypointRoom {
     /// The keypoints of the room.
     pub fn map(&self) -> &KeypointMap {
         &self.map
+    }
+
+    /// `world_from_camera` of the mapped frames.
+    pub fn poses(&self) -> &[Pose] {
+        &self.poses
+    }
+
+    /// Approximate memory use, bytes.
+    pub fn memory_bytes(&self) -> usize {
+        let frames = self.map.frames.iter();
+        let keypoints: usize = frames.map(MappedKeypoints::memory_bytes).sum();
+        keypoints + self.places.memory_bytes() + size_of_val(self.poses.as_slice())
     }
 
     /// Estimates the pose of a view.
@@ -192,6 +207,7 @@ impl KeypointRoom {
         Ok(LocatedView {
             pose,
             inliers,
+            keypoints: keypoints.len(),
             novelty,
             matched,
         })

@@ -34,7 +34,7 @@ pub enum Method {
 }
 
 /// The localizers of one room.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Default)]
 pub struct RoomLocalizer<'a> {
     /// The keypoints of the room, if it has any.
     pub keypoints: Option<&'a KeypointRoom>,
@@ -96,7 +96,20 @@ impl RoomLocalizer<'_> {
             None => None,
         };
 
-        let adapter = self.adapter.zip(view.query);
+        self.locate_by_similarity(view.query, unmatched)
+    }
+
+    /// Estimates the pose of a view from the most similar mapped frames. `unmatched` is why its
+    /// keypoints do not locate it, if they were tried.
+    ///
+    /// # Errors
+    /// As [`Self::locate`].
+    pub fn locate_by_similarity(
+        &self,
+        query: Option<MapQuery<'_>>,
+        unmatched: Option<NotLocated>,
+    ) -> Result<PoseEstimate, NotInRoom> {
+        let adapter = self.adapter.zip(query);
         let nearest = adapter.map(|(adapter, query)| adapter.estimate(query));
         let by_keypoints = unmatched.map(|why| why.novelty());
         let novelty = match &nearest {
@@ -129,7 +142,8 @@ impl RoomLocalizer<'_> {
 }
 
 impl PoseEstimate {
-    fn matched(located: LocatedView) -> Self {
+    /// The estimate of matched keypoints.
+    pub fn matched(located: LocatedView) -> Self {
         Self {
             pose: located.pose.pose,
             covariance: Some(located.pose.covariance),

@@ -44,6 +44,20 @@ pub struct MappedKeypoints {
 }
 
 impl MappedKeypoints {
+    /// Approximate memory use, bytes.
+    pub fn memory_bytes(&self) -> usize {
+        let Self {
+            points,
+            inverse_depths,
+            deviations,
+            descriptors,
+        } = self;
+        size_of_val(points.as_slice())
+            + size_of_val(inverse_depths.as_slice())
+            + size_of_val(deviations.as_slice())
+            + descriptors.len()
+    }
+
     /// The number of keypoints.
     pub fn len(&self) -> usize {
         self.points.len()

@@ -45,6 +45,11 @@ impl PlaceIndex {
         Self { centers, rows }
     }
 
+    /// Approximate memory use, bytes.
+    pub fn memory_bytes(&self) -> usize {
+        (self.centers.len() + self.rows.len()) * size_of::<f32>()
+    }
+
     /// Rows of the `count` frames most similar to a view with these compressed descriptors, the most
     /// similar first.
     pub fn nearest(&self, descriptors: ArrayView2<'_, f32>, count: usize) -> Vec<usize> {

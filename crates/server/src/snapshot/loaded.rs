@@ -9,6 +9,7 @@ use seese3_core::eval::TrainedOn;
 use seese3_core::features::FeatureSource;
 use seese3_core::navigation::Navigator;
 use seese3_robot::fitting::RoomReader;
+use seese3_robot::localization::KeypointRoom;
 use seese3_robot::tracking::Map;
 use seese3_store::StoredAdapter;
 
@@ -25,6 +26,8 @@ pub struct Candidate {
 pub struct LoadedRoom {
     /// One for each adapter that serves the room, in order of preference.
     pub navigators: Vec<Arc<ServedNavigator>>,
+    /// The keypoints of the room, if it has any.
+    pub keypoints: Option<Arc<KeypointRoom>>,
     /// Adapters with matching features that cannot serve the room, by name.
     pub refused: BTreeMap<String, Refusal>,
 }
@@ -81,11 +84,14 @@ impl LoadedRoom {
     pub(super) fn memory_bytes(&self) -> usize {
         let room = self.navigators.first();
         let room = room.map_or(0, |served| served.navigator.room().memory_bytes());
+        let keypoints = self.keypoints.as_ref();
+        let keypoints = keypoints.map_or(0, |keypoints| keypoints.memory_bytes());
         let navigators = self.navigators.iter();
 
-        room + navigators
-            .map(|served| served.memory_bytes())
-            .sum::<usize>()
+        room + keypoints
+            + navigators
+                .map(|served| served.memory_bytes())
+                .sum::<usize>()
     }
 }
 

@@ -25,7 +25,9 @@ use super::room_loading::{Problem, RoomLoader, contained};
 use super::served::ServedRoom;
 use super::{Refusal, Snapshot};
 use seese3_core::features::FeatureSource;
+use seese3_core::keypoints::KeypointSource;
 use seese3_core::room::RoomId;
+use seese3_encoder::Encoder;
 use seese3_store::{Defaults, Kind, RoomFit, StandingDefaults, Store, StoredAdapter};
 
 /// Whether previously refused revisions are retried.
@@ -125,7 +127,9 @@ impl Loader {
 
         if !snapshot.rooms.is_empty() {
             if let Some(encoders) = &self.encoders {
-                image_encoder::warn_of_unneeded(&encoders.models, &snapshot.adapters);
+                let rooms = snapshot.rooms.values();
+                let keypoints = rooms.filter_map(|room| room.summary.keypoints.as_ref());
+                image_encoder::warn_of_unneeded(&encoders.models, &snapshot.adapters, keypoints);
             }
             return Ok(snapshot);
         }
@@ -187,6 +191,7 @@ impl Loader {
                 .extend(chosen.map(|adapter| (name.clone(), adapter)));
         }
         self.add_rooms(&mut loaded, before, refused, rooms).await?;
+        self.add_keypoint_encoders(&mut loaded, before);
 
         Ok(loaded)
     }
@@ -325,6 +330,47 @@ impl Loader {
             };
             if let Some(encoder) = encoder {
                 loaded.image_encoders.insert(name.clone(), encoder);
+            }
+        }
+    }
+
+    /// Adds the encoders of the rooms' keypoints. A room whose encoder cannot be used is served
+    /// without matching keypoints.
+    fn add_keypoint_encoders(&self, loaded: &mut Snapshot, before: &Snapshot) {
+        let Some(encoders) = &self.encoders else {
+            return;
+        };
+
+        let mut tried: Vec<KeypointSource> = Vec::new();
+        for (name, room) in &loaded.rooms {
+            let Some(source) = &room.summary.keypoints else {
+                continue;
+            };
+            if tried.iter().any(|other| other.is_like(source)) {
+                continue;
+            }
+            tried.push(source.clone());
+
+            let mut known = before.keypoint_encoders.iter();
+            if let Some(known) = known.find(|(other, _)| other.is_like(source)) {
+                loaded.keypoint_encoders.push(known.clone());
+                continue;
+            }
+
+            match Encoder::of_keypoints(source, &encoders.models, &encoders.runtime) {
+                Ok(Some(encoder)) => {
+                    let encoder = ImageEncoder::new(encoder, encoders.bounds);
+                    let encoder = Arc::new(encoder.counted_in(self.metrics.clone()));
+                    loaded.keypoint_encoders.push((source.clone(), encoder));
+                }
+                Ok(None) => tracing::warn!(
+                    room = name,
+                    encoder = source.feature.encoder,
+                    "no --encoder detects the room's keypoints; views are not matched with them"
+                ),
+                Err(problem) => tracing::error!(
+                    room = name, %problem, "no encoder of keypoints; views are not matched with them"
+                ),
             }
         }
     }

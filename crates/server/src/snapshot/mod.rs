@@ -22,6 +22,7 @@ use super::auth::RoomScope;
 use super::image_encoder::ImageEncoder;
 use super::metrics::ServedCounts;
 use super::two_views::TwoViewReader;
+use seese3_core::keypoints::KeypointSource;
 use seese3_store::StoredAdapter;
 
 /// A stored revision that cannot be served.
@@ -61,6 +62,9 @@ pub struct Refusals {
     pub adapters: BTreeMap<String, Refusal>,
 }
 
+/// Encoders of keypoints, by what they detect.
+type KeypointEncoders = Vec<(KeypointSource, Arc<ImageEncoder>)>;
+
 /// The served rooms and adapters of a store.
 #[derive(Default)]
 pub struct Snapshot {
@@ -68,7 +72,10 @@ pub struct Snapshot {
     /// The operator's default adapters, by room.
     default_adapters: BTreeMap<String, String>,
     adapters: BTreeMap<String, Arc<StoredAdapter>>,
+    /// By the name of the adapter.
     image_encoders: BTreeMap<String, Arc<ImageEncoder>>,
+    /// Encoders of the rooms' keypoints.
+    keypoint_encoders: KeypointEncoders,
     two_views: Option<Arc<TwoViewReader>>,
     refused: Refusals,
 }
@@ -95,6 +102,7 @@ impl Snapshot {
             default_adapters: owned(chosen.filter(|(name, _)| scope.contains(name))),
             adapters: owned(self.adapters.iter().filter(is_seen)),
             image_encoders: self.image_encoders.clone(),
+            keypoint_encoders: self.keypoint_encoders.clone(),
             two_views: self.two_views.clone(),
             refused: Refusals {
                 rooms: owned(refused_rooms.filter(|(name, _)| scope.contains(name))),
@@ -109,6 +117,7 @@ impl Snapshot {
     pub fn without_rooms(&self) -> Self {
         Self {
             image_encoders: self.image_encoders.clone(),
+            keypoint_encoders: self.keypoint_encoders.clone(),
             ..Self::default()
         }
     }
@@ -161,6 +170,7 @@ impl Snapshot {
         same(&self.rooms, &other.rooms)
             && same(&self.adapters, &other.adapters)
             && same(&self.image_encoders, &other.image_encoders)
+            && self.keypoint_encoders.len() == other.keypoint_encoders.len()
             && self.default_adapters == other.default_adapters
             && self.refused == other.refused
     }
@@ -183,6 +193,15 @@ impl Snapshot {
                 adapter.name
             ))
         })
+    }
+
+    /// The encoder of a room's keypoints; `None` if the room has no keypoints or this server has no
+    /// such encoder.
+    pub fn keypoint_encoder(&self, room: &ServedRoom) -> Option<&ImageEncoder> {
+        let source = room.summary.keypoints.as_ref()?;
+        let mut encoders = self.keypoint_encoders.iter();
+        let (_, encoder) = encoders.find(|(made, _)| made.is_like(source))?;
+        Some(encoder)
     }
 
     /// Number of rooms.

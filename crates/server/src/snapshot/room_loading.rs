@@ -15,6 +15,7 @@ use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::room::{FrameId, Room, RoomId};
 use seese3_core::training::RoomData;
 use seese3_robot::fitting::{Localizer, RoomReader};
+use seese3_robot::localization::KeypointRoom;
 use seese3_robot::tracking::Map;
 use seese3_store::{RoomFit, Store, StoredAdapter, StoredRoom};
 
@@ -106,6 +107,13 @@ impl RoomLoader {
         let frames = Arc::new(stored.room.clone());
 
         let before = room.loaded_before;
+        let keypoints_before = before.and_then(|before| before.keypoints.clone());
+        let keypoints = stored.keypoints.as_ref().map(|keypoints| {
+            keypoints_before.unwrap_or_else(|| {
+                let poses = stored.room.poses().to_vec();
+                Arc::new(KeypointRoom::new(poses, keypoints.map.clone()))
+            })
+        });
         let mut navigators: Vec<Arc<ServedNavigator>> = Vec::new();
         let mut refused = BTreeMap::new();
 
@@ -140,6 +148,7 @@ impl RoomLoader {
 
         Ok(LoadedRoom {
             navigators,
+            keypoints,
             refused,
         })
     }

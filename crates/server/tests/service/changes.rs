@@ -484,7 +484,7 @@ async fn a_room_is_fitted_on_the_server() {
         r.rooms = vec!["hall".to_owned()];
         r.view = feature(features.rows().row(100).to_vec());
     });
-    assert!(located.await.located.is_some());
+    assert!(located.await.fitted.is_some());
 
     // The same again is answered from memory, without a fit.
     let mut steps = 0;

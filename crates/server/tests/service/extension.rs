@@ -111,7 +111,7 @@ async fn streams_and_tokens_survive_the_growth_of_a_room() {
             view: feature(served("attic").1.rows().row(40).to_vec()),
             ..pb::LocalizeRequest::default()
         };
-        server.client.localize(request).await.unwrap().located
+        server.client.localize(request).await.unwrap().fitted
     };
     assert!(located().await.is_none());
     server.client.refit_room(fit(), |_| ()).await.unwrap();

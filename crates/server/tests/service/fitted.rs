@@ -82,7 +82,9 @@ async fn a_view_is_located_in_the_room_of_its_adapter() {
             .localize(localize("hall", view))
             .await
             .unwrap();
-        let located = answer.located.unwrap();
+        assert_eq!(answer.method(), pb::LocalizationMethod::FittedAdapter);
+        let located = answer.pose.unwrap();
+        let fitted = answer.fitted.unwrap();
 
         let pose = convert::pose(&located.pose.unwrap()).unwrap();
         let error = PoseError::between(&pose, &room.poses()[row]);
@@ -91,9 +93,11 @@ async fn a_view_is_located_in_the_room_of_its_adapter() {
             "{error:?}"
         );
         assert_eq!(located.covariance.len(), 36);
-        assert_eq!(located.frame_id as usize, row);
-        assert!(["fitted", "zero-shot", "nearest-frame"].contains(&&*located.translation_reader));
-        assert!((0.0..=1.0).contains(&located.rotation_gain));
+        assert_eq!(fitted.frame_id as usize, row);
+        assert!(["fitted", "zero-shot", "nearest-frame"].contains(&&*fitted.translation_reader));
+        assert!((0.0..=1.0).contains(&fitted.rotation_gain));
+        assert_eq!(answer.room.unwrap().name, "hall");
+        assert!(answer.novelty.unwrap() <= 1.0 && answer.reason.is_empty());
     }
 
     // A stored frame has a pose of its own.
@@ -102,7 +106,13 @@ async fn a_view_is_located_in_the_room_of_its_adapter() {
         .localize(localize("hall", frame(3)))
         .await
         .unwrap();
-    assert!(answer.located.is_none());
+    assert_eq!(answer.method(), pb::LocalizationMethod::Recorded);
+    let pose = convert::pose(&answer.pose.unwrap().pose.unwrap()).unwrap();
+    let error = PoseError::between(&pose, &room.poses()[3]);
+    assert!(
+        error.translation_m < 1e-9 && error.rotation_rad < 1e-7,
+        "{error:?}"
+    );
 }
 
 /// Oracle: the promise of NavigateTo: nothing is planned for a view that tells no place. An adapter
@@ -168,7 +178,10 @@ async fn a_fitted_adapter_serves_no_other_room() {
     };
     let attic = server.client.localize(by_default("attic")).await.unwrap();
     assert_eq!(attic.adapter.unwrap().name, "base");
-    assert!(attic.located.is_none());
+    assert_ne!(
+        pb::LocalizationMethod::try_from(attic.method),
+        Ok(pb::LocalizationMethod::FittedAdapter)
+    );
 
     let hall = server.client.localize(by_default("hall")).await.unwrap();
     assert_eq!(hall.adapter.unwrap().name, "hall.fitted");
@@ -195,25 +208,22 @@ async fn a_fitted_room_is_relocalised_by_its_own_adapter() {
         panic!("{found:?}")
     };
     assert_eq!(hall.room.as_ref().unwrap().name, "hall");
-    assert!(attic.located.is_none() && attic.pose.is_some());
-
-    let located = hall.located.as_ref().unwrap();
-    assert_eq!(
-        (&hall.pose, &hall.covariance),
-        (&located.pose, &located.covariance)
-    );
+    assert!(attic.fitted.is_none());
+    assert_eq!(hall.method(), pb::LocalizationMethod::FittedAdapter);
     let alone = server
         .client
         .localize(localize("hall", feature(view)))
         .await;
-    assert_eq!(alone.unwrap().located.as_ref(), Some(located));
+    let alone = alone.unwrap();
+    assert_eq!((&alone.pose, &alone.fitted), (&hall.pose, &hall.fitted));
 
-    let pose = convert::pose(hall.pose.as_ref().unwrap()).unwrap();
+    let pose = hall.pose.as_ref().unwrap().pose.as_ref().unwrap();
+    let pose = convert::pose(pose).unwrap();
     let error = PoseError::between(&pose, &room.poses()[100]);
     assert!(error.translation_m < 0.05, "{error:?}");
 
     let row = features.rows().row(100).to_vec();
     let view = latent(calibrated().0.embed_one(&row).unwrap().to_vec());
     let found = server.client.relocalize(ask(view)).await.unwrap();
-    assert!(found.rooms.iter().all(|room| room.located.is_none()));
+    assert!(found.rooms.iter().all(|room| room.fitted.is_none()));
 }
