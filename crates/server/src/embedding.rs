@@ -5,10 +5,12 @@ use std::sync::Arc;
 
 use ndarray::Array1;
 
+use super::image_encoder::ImageEncoder;
 use super::snapshot::{ServedNavigator, Snapshot};
 use super::status::view_error;
 use super::{Error, convert};
 use seese3_client::proto::v1 as pb;
+use seese3_core::keypoints::Keypoints;
 use seese3_core::navigation::Source;
 use seese3_robot::tracking::View;
 use seese3_store::StoredAdapter;
@@ -19,6 +21,8 @@ pub struct ViewEmbedder<'a> {
     /// The encoders of images.
     pub snapshot: &'a Snapshot,
     pub frames: StoredFrames<'a>,
+    /// The encoder of the keypoints of images, if they are to be detected.
+    pub detector: Option<&'a ImageEncoder>,
 }
 
 /// What a view that is a stored frame means.
@@ -40,6 +44,15 @@ pub struct EmbeddedView {
     pub feature: Option<Vec<f32>>,
     /// Whether the view is an image without contrast.
     pub is_blank: bool,
+    /// The keypoints of an image, if they were detected.
+    pub keypoints: Option<ImageKeypoints>,
+}
+
+/// The keypoints of an image.
+pub struct ImageKeypoints {
+    pub keypoints: Keypoints,
+    /// Width and height of the image, pixels.
+    pub size: [usize; 2],
 }
 
 impl ViewEmbedder<'_> {
@@ -58,8 +71,24 @@ impl ViewEmbedder<'_> {
             let pixels = encoder.decoded(&image_field, image)?;
             let is_blank = pixels.is_blank();
 
-            let feature = encoder.feature_of(&image_field, pixels)?;
-            return self.embed_feature(field, feature, is_blank);
+            let Some(detector) = self.detector else {
+                let feature = encoder.feature_of(&image_field, pixels)?;
+                return self.embed_feature(field, feature, is_blank);
+            };
+
+            // One pass gives keypoints and feature if both come from the same encoder.
+            let size = [pixels.width, pixels.height];
+            let frame = detector.frame_of(&image_field, pixels.clone())?;
+            let feature = if detector.makes(self.adapter.adapter.source()) {
+                frame.feature
+            } else {
+                encoder.feature_of(&image_field, pixels)?
+            };
+            let keypoints = frame.keypoints.unwrap_or_default();
+            return Ok(EmbeddedView {
+                keypoints: Some(ImageKeypoints { keypoints, size }),
+                ..self.embed_feature(field, feature, is_blank)?
+            });
         }
 
         match convert::source(field, view, self.adapter, self.snapshot)? {
@@ -68,6 +97,7 @@ impl ViewEmbedder<'_> {
                 latent: self.latent(field, &View::Latent(values))?,
                 feature: None,
                 is_blank: false,
+                keypoints: None,
             }),
             Source::Frame(frame) => {
                 let frame_field = format!("{field}.frame_id");
@@ -90,6 +120,7 @@ impl ViewEmbedder<'_> {
                     latent: served.navigator.latents().row(frame.row()).to_owned(),
                     feature: None,
                     is_blank: false,
+                    keypoints: None,
                 })
             }
         }
@@ -110,6 +141,7 @@ impl ViewEmbedder<'_> {
             latent,
             feature: Some(feature),
             is_blank,
+            keypoints: None,
         })
     }
 
@@ -154,6 +186,7 @@ impl RequestAdapter {
                 Some(served) => StoredFrames::Of(served),
                 None => StoredFrames::RoomMissing,
             },
+            detector: None,
         }
     }
 }

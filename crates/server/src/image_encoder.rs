@@ -96,6 +96,12 @@ impl ImageEncoder {
         let mut frames = frames.map_err(|error| request_error(field, error))?;
         frames.pop().ok_or(Error::Internal)
     }
+
+    /// Whether the features of this encoder are those of `source`.
+    pub fn makes(&self, source: &FeatureSource) -> bool {
+        let made = self.encoder.sources("");
+        made.iter().any(|made| made.is_like(source))
+    }
 }
 
 /// A bad image is the caller's error, on `field`. Any other error is internal and only logged.

@@ -140,10 +140,12 @@ impl<'a> ImageView<'a> {
 
         let camera = match &self.camera {
             GivenCamera::Stated(camera) => *camera,
-            GivenCamera::Mapping => mapped.map().camera,
+            GivenCamera::Mapping => mapped.room.map().camera,
         };
-        self.check_aspect(&camera)?;
-        Ok(Some(mapped.locate(ViewKeypoints {
+        let RgbImage { width, height, .. } = self.image;
+        check_aspect(width, height, &camera)
+            .map_err(|problem| Error::invalid(format!("{}.image", self.fields.view), problem))?;
+        Ok(Some(mapped.room.locate(ViewKeypoints {
             keypoints: &pass.keypoints,
             camera: &camera,
         })))
@@ -164,7 +166,7 @@ impl<'a> ImageView<'a> {
         let Some(source) = &room.summary.keypoints else {
             return Ok(None);
         };
-        let Some(encoder) = self.snapshot.keypoint_encoder(room) else {
+        let Some(encoder) = self.snapshot.keypoint_encoder(source) else {
             return Ok(None);
         };
 
@@ -183,23 +185,22 @@ impl<'a> ImageView<'a> {
         self.passes.borrow_mut().push(pass.clone());
         Ok(Some(pass))
     }
+}
 
-    fn check_aspect(&self, camera: &CameraIntrinsics) -> Result<(), Error> {
-        let RgbImage { width, height, .. } = self.image;
-        let aspect = height as f64 / width as f64;
-        if (aspect / camera.height() - 1.0).abs() <= MAX_ASPECT_DIFFERENCE {
-            return Ok(());
-        }
-
-        let problem = format!(
-            "has {width} × {height} pixels, height / width {aspect:.3}; its camera has {:.3}",
-            camera.height()
-        );
-        Err(Error::invalid(
-            format!("{}.image", self.fields.view),
-            problem,
-        ))
+/// Checks that an image of this size can be of the camera.
+///
+/// # Errors
+/// What is wrong with the image.
+pub fn check_aspect(width: usize, height: usize, camera: &CameraIntrinsics) -> Result<(), String> {
+    let aspect = height as f64 / width as f64;
+    if (aspect / camera.height() - 1.0).abs() <= MAX_ASPECT_DIFFERENCE {
+        return Ok(());
     }
+
+    Err(format!(
+        "has {width} × {height} pixels, height / width {aspect:.3}; its camera has {:.3}",
+        camera.height()
+    ))
 }
 
 /// The first room whose keypoints this server can match, with their encoder.
@@ -207,9 +208,10 @@ fn first_with_keypoints<'a>(
     snapshot: &'a Snapshot,
     rooms: &'a [Arc<ServedRoom>],
 ) -> Option<(&'a ServedRoom, &'a ImageEncoder)> {
-    rooms
-        .iter()
-        .find_map(|room| Some((room.as_ref(), snapshot.keypoint_encoder(room)?)))
+    rooms.iter().find_map(|room| {
+        let source = room.summary.keypoints.as_ref()?;
+        Some((room.as_ref(), snapshot.keypoint_encoder(source)?))
+    })
 }
 
 fn given_camera(field: &str, camera: &pb::ViewCamera) -> Result<GivenCamera, Error> {

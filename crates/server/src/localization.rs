@@ -317,10 +317,12 @@ pub(super) fn best_match(tried: Vec<RoomTried>) -> BestMatch {
 
 /// Why keypoints were not tried with the rooms; empty if none has keypoints.
 fn not_tried(snapshot: &Snapshot, asked: &[Arc<ServedRoom>]) -> String {
-    let Some(room) = asked.iter().find(|room| room.summary.keypoints.is_some()) else {
+    let sources = asked.iter();
+    let mut sources = sources.filter_map(|room| room.summary.keypoints.as_ref());
+    let Some(source) = sources.next() else {
         return String::new();
     };
-    if snapshot.keypoint_encoder(room).is_none() {
+    if snapshot.keypoint_encoder(source).is_none() {
         return "keypoints were not matched: this server has no encoder of the room's keypoints"
             .to_owned();
     }

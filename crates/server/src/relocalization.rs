@@ -272,6 +272,7 @@ fn embedded(
         adapter: stored,
         snapshot,
         frames: StoredFrames::Refused,
+        detector: None,
     };
 
     let mut embedded = Vec::with_capacity(views.len());

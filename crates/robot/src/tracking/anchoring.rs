@@ -18,6 +18,8 @@ const GATE: f64 = 16.81;
 const REFUSED_BEYOND: f64 = 4.0;
 /// Number of consecutive anchors that must agree before their pose becomes the map pose.
 pub const ANCHORS_TO_AGREE: u32 = 10;
+/// The same for poses from matched keypoints.
+const MATCHED_VIEWS_TO_AGREE: u32 = 2;
 /// Upper bound of the time between two anchors, seconds: after such a pause they are independent.
 const LONGEST_PAUSE_S: f64 = 10.0;
 
@@ -187,7 +189,12 @@ impl Tracker {
         }
 
         if view.matches_room() {
-            self.correct(state, poses, frame, view.room, anchor)
+            let needed = if view.is_proven {
+                MATCHED_VIEWS_TO_AGREE
+            } else {
+                ANCHORS_TO_AGREE
+            };
+            self.correct(state, poses, frame, (view.room, needed), anchor)
         } else {
             correct_believed(state, poses, frame, view.room, anchor)
         }
@@ -195,7 +202,8 @@ impl Tracker {
 
     /// Anchor of the stream's camera from a view, with a covariance inflated for time correlation.
     ///
-    /// The pose comes from the room's [`super::PoseReader`] if there is one and the match is
+    /// Matched keypoints give the pose, if there are any. Otherwise it comes from the room's
+    /// [`super::PoseReader`] if there is one and the match is
     /// certain; otherwise from the matched frames. Outside the mapped part a reader is
     /// overconfident.
     fn anchor(
@@ -210,12 +218,16 @@ impl Tracker {
             memory_s,
             lasting_share,
         } = view.matched.anchor;
-        let feature = view.feature.filter(|_| view.matched.is_certain);
-        let by_reader = self.maps[view.room].pose_by_reader(feature);
-        let mut belief = by_reader.unwrap_or_else(|| match &state.recent_matches {
-            Some(recent) if view.other.is_none() => recent.tempered(belief),
-            _ => belief,
-        });
+        let mut belief = if view.is_proven {
+            belief
+        } else {
+            let feature = view.feature.filter(|_| view.matched.is_certain);
+            let by_reader = self.maps[view.room].pose_by_reader(feature);
+            by_reader.unwrap_or_else(|| match &state.recent_matches {
+                Some(recent) if view.other.is_none() => recent.tempered(belief),
+                _ => belief,
+            })
+        };
 
         if let Some(other) = view.other {
             belief = belief.of_attached(&other.camera_from_other.inverse());
@@ -247,13 +259,13 @@ impl Tracker {
 
     /// Corrects the map pose by an anchor. An anchor below the rejection threshold is applied at
     /// once. Otherwise, or without a believed pose, the anchor supports a candidate. The candidate
-    /// is applied once [`ANCHORS_TO_AGREE`] consecutive anchors agree.
+    /// is applied once `needed` consecutive anchors agree.
     fn correct(
         &self,
         state: &mut State,
         poses: &mut Poses,
         frame: &Observation,
-        room: usize,
+        (room, needed): (usize, u32),
         counted: InflatedAnchor,
     ) -> Correction {
         let anchor = counted.belief;
@@ -281,7 +293,7 @@ impl Tracker {
             _ => (anchor, 1),
         };
 
-        let is_applied = agreeing_anchors >= ANCHORS_TO_AGREE;
+        let is_applied = agreeing_anchors >= needed;
         if is_applied {
             state.room = Some(room);
             state.corrected_ns = Some(frame.time_ns);

@@ -48,7 +48,9 @@ pub use replay::{
     replay_frames, replay_streams,
 };
 pub use rig::{OtherCamera, OtherView};
-pub use state::{Candidate, Keyframe, LastFrame, Observation, Place, Refusal, State, Update};
+pub use state::{
+    Candidate, Keyframe, LastFrame, MatchedPose, Observation, Place, Refusal, State, Update,
+};
 pub use tracker::{Tracker, TrackerSettings};
 pub use view::{View, motion};
 pub use wheel_odometry::{Drift, LastMeasured, MeasuredPose, OdometryAccumulator, OdometryDelta};

@@ -8,9 +8,9 @@ use ndarray::{Array1, ArrayView1};
 
 use super::map::MapMatch;
 use super::sight::{Sight, UNCHANGED_DISTANCE, distance};
-use super::state::{Observation, State};
+use super::state::{MatchedPose, Observation, State};
 use super::tracker::Tracker;
-use super::{MapQuery, PoseWithCovariance, ROOM_RATIO, RecentMatches};
+use super::{MapAnchor, MapQuery, PoseWithCovariance, ROOM_RATIO, RecentMatches};
 use seese3_core::geometry::Pose;
 
 /// View of another camera on the same robot, simultaneous with a frame.
@@ -53,10 +53,32 @@ pub(super) struct MatchedView<'a> {
     pub room: usize,
     /// Whether no other map matches nearly as well, by [`ROOM_RATIO`].
     pub is_clear: bool,
+    /// Whether matched keypoints give the pose. They prove the place, whatever the distance of the
+    /// latent.
+    pub is_proven: bool,
     pub matched: MapMatch,
 }
 
 impl MatchedView<'_> {
+    /// The view with the pose of its matched keypoints.
+    fn proven_by(self, found: &MatchedPose) -> Self {
+        Self {
+            is_clear: true,
+            is_proven: true,
+            matched: MapMatch {
+                is_certain: true,
+                out_of_distribution: found.novelty,
+                anchor: MapAnchor {
+                    belief: found.pose,
+                    memory_s: 0.0,
+                    lasting_share: 0.0,
+                },
+                ..self.matched
+            },
+            ..self
+        }
+    }
+
     /// Whether the view is usable and in distribution.
     pub(super) fn matches_room(&self) -> bool {
         self.sight == Sight::Clear && self.matched.out_of_distribution <= 1.0
@@ -104,8 +126,13 @@ impl Tracker {
             is_blank: frame.is_blank,
             unchanged_frames: state.unchanged_frames,
         };
-        let mut leading = self.matched(state.room, &own, None);
-        if leading.sight == Sight::Clear {
+        let mut leading = match &frame.matched {
+            Some(matched) => self
+                .matched(Some(matched.room), &own, None)
+                .proven_by(matched),
+            None => self.matched(state.room, &own, None),
+        };
+        if leading.sight == Sight::Clear && !leading.is_proven {
             let anchor = &leading.matched.anchor.belief;
             let recent = RecentMatches::after(state.recent_matches, frame.time_ns, anchor);
             state.recent_matches = Some(recent);
@@ -202,6 +229,7 @@ impl Tracker {
             is_repeated: view.unchanged_frames > 0,
             room,
             is_clear,
+            is_proven: false,
             matched,
         }
     }

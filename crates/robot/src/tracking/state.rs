@@ -23,6 +23,8 @@ pub struct Observation {
     /// Raw feature of the latent, shape (d,), if known: used to retrieve mapped frames, and by the
     /// [`super::PoseReader`] of a map.
     pub feature: Option<Vec<f32>>,
+    /// Pose of the view from keypoints that were matched with a map, if they locate it.
+    pub matched: Option<MatchedPose>,
     /// Whether the image is known to be blank: nearly uniform brightness.
     pub is_blank: bool,
     /// Camera pose from wheel or inertial odometry, in the odometry frame of that sensor.
@@ -41,12 +43,24 @@ impl Observation {
             sequence,
             latent,
             feature: None,
+            matched: None,
             is_blank: false,
             measured: None,
             gravity: None,
             other_views: Vec::new(),
         }
     }
+}
+
+/// Pose of a view from keypoints that were matched with a map.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MatchedPose {
+    /// The map, an index of [`super::Tracker::maps`].
+    pub room: usize,
+    /// `world_from_camera`.
+    pub pose: PoseWithCovariance,
+    /// How unlike the view is to the map, relative to the limit; at most 1.
+    pub novelty: f64,
 }
 
 /// Complete state of a tracked stream.

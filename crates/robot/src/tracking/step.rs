@@ -122,6 +122,9 @@ impl Tracker {
                 continuity => continuity,
             },
         });
+        if seen.leading.is_proven && matches_room {
+            state.health = TrackingHealth::confirmed();
+        }
         state.frames_off_map = if matches_room {
             0
         } else {

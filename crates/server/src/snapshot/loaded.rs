@@ -7,6 +7,7 @@ use super::Refusal;
 use super::content::Content;
 use seese3_core::eval::TrainedOn;
 use seese3_core::features::FeatureSource;
+use seese3_core::keypoints::KeypointSource;
 use seese3_core::navigation::Navigator;
 use seese3_robot::fitting::RoomReader;
 use seese3_robot::localization::KeypointRoom;
@@ -27,9 +28,18 @@ pub struct LoadedRoom {
     /// One for each adapter that serves the room, in order of preference.
     pub navigators: Vec<Arc<ServedNavigator>>,
     /// The keypoints of the room, if it has any.
-    pub keypoints: Option<Arc<KeypointRoom>>,
+    pub keypoints: Option<ServedKeypoints>,
     /// Adapters with matching features that cannot serve the room, by name.
     pub refused: BTreeMap<String, Refusal>,
+}
+
+/// The keypoints of a room.
+#[derive(Clone)]
+pub struct ServedKeypoints {
+    /// What detects them.
+    pub source: KeypointSource,
+    /// The room's map of keypoints.
+    pub room: Arc<KeypointRoom>,
 }
 
 /// A room with one adapter that serves it.
@@ -49,6 +59,8 @@ pub struct ServedNavigator {
     pub trained_on: TrainedOn,
     /// Locates single views; only if the adapter was fitted to exactly these frames.
     pub reader: Option<Arc<RoomReader>>,
+    /// The keypoints of the room and their source, if it has any.
+    pub keypoints: Option<ServedKeypoints>,
     /// The reader of the most preferred fitted adapter, from which the map takes its anchors.
     pub(super) tracking_reader: Option<Arc<RoomReader>>,
 }
@@ -85,7 +97,7 @@ impl LoadedRoom {
         let room = self.navigators.first();
         let room = room.map_or(0, |served| served.navigator.room().memory_bytes());
         let keypoints = self.keypoints.as_ref();
-        let keypoints = keypoints.map_or(0, |keypoints| keypoints.memory_bytes());
+        let keypoints = keypoints.map_or(0, |keypoints| keypoints.room.memory_bytes());
         let navigators = self.navigators.iter();
 
         room + keypoints

@@ -195,10 +195,8 @@ impl Snapshot {
         })
     }
 
-    /// The encoder of a room's keypoints; `None` if the room has no keypoints or this server has no
-    /// such encoder.
-    pub fn keypoint_encoder(&self, room: &ServedRoom) -> Option<&ImageEncoder> {
-        let source = room.summary.keypoints.as_ref()?;
+    /// The encoder of keypoints; `None` if this server has no such encoder.
+    pub fn keypoint_encoder(&self, source: &KeypointSource) -> Option<&ImageEncoder> {
         let mut encoders = self.keypoint_encoders.iter();
         let (_, encoder) = encoders.find(|(made, _)| made.is_like(source))?;
         Some(encoder)

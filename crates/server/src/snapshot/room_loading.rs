@@ -8,7 +8,7 @@ use futures_util::FutureExt;
 
 use super::Refusal;
 use super::content::Content;
-use super::loaded::{Candidate, LoadedRoom, ServedNavigator, reader_of};
+use super::loaded::{Candidate, LoadedRoom, ServedKeypoints, ServedNavigator, reader_of};
 use seese3_core::eval::TrainedOn;
 use seese3_core::features::Features;
 use seese3_core::navigation::{IndexKind, Navigator};
@@ -95,6 +95,13 @@ pub struct RoomToLoad<'a> {
     pub loaded_before: Option<&'a LoadedRoom>,
 }
 
+/// A room while its adapters are loaded.
+struct LoadingRoom<'a> {
+    stored: &'a StoredRoom,
+    frames: &'a Arc<Room>,
+    keypoints: Option<&'a ServedKeypoints>,
+}
+
 impl RoomLoader {
     /// Loads a room with its adapters, reusing unchanged parts of the previous load.
     ///
@@ -111,17 +118,23 @@ impl RoomLoader {
         let keypoints = stored.keypoints.as_ref().map(|keypoints| {
             keypoints_before.unwrap_or_else(|| {
                 let poses = stored.room.poses().to_vec();
-                Arc::new(KeypointRoom::new(poses, keypoints.map.clone()))
+                ServedKeypoints {
+                    source: keypoints.source.clone(),
+                    room: Arc::new(KeypointRoom::new(poses, keypoints.map.clone())),
+                }
             })
         });
+        let loaded = LoadingRoom {
+            stored: &stored,
+            frames: &frames,
+            keypoints: keypoints.as_ref(),
+        };
         let mut navigators: Vec<Arc<ServedNavigator>> = Vec::new();
         let mut refused = BTreeMap::new();
 
         for candidate in room.candidates {
             let adapter = &candidate.adapter;
-            let served = self
-                .under(&stored, &frames, adapter, &navigators, before)
-                .await;
+            let served = self.under(&loaded, adapter, &navigators, before).await;
             let problem = match served {
                 Ok(served) => {
                     navigators.push(served);
@@ -139,9 +152,7 @@ impl RoomLoader {
 
             // A failure of the previous revision is not logged: it served until now.
             if let Some(earlier) = &candidate.earlier {
-                let served = self
-                    .under(&stored, &frames, earlier, &navigators, before)
-                    .await;
+                let served = self.under(&loaded, earlier, &navigators, before).await;
                 navigators.extend(served.ok());
             }
         }
@@ -157,8 +168,7 @@ impl RoomLoader {
     /// preferred adapters.
     async fn under(
         &self,
-        stored: &StoredRoom,
-        room: &Arc<Room>,
+        room: &LoadingRoom<'_>,
         adapter: &Arc<StoredAdapter>,
         first: &[Arc<ServedNavigator>],
         before: Option<&LoadedRoom>,
@@ -170,7 +180,7 @@ impl RoomLoader {
         match known {
             Some(known) => Ok(known.clone()),
             None => self
-                .navigator(stored, room, adapter, tracking_reader)
+                .navigator(room, adapter, tracking_reader)
                 .await
                 .map(Arc::new),
         }
@@ -180,11 +190,15 @@ impl RoomLoader {
     /// adapter was fitted to the room.
     async fn navigator(
         &self,
-        stored: &StoredRoom,
-        room: &Arc<Room>,
+        loading: &LoadingRoom<'_>,
         adapter: &Arc<StoredAdapter>,
         tracking_reader: Option<Arc<RoomReader>>,
     ) -> Result<ServedNavigator, Problem> {
+        let LoadingRoom {
+            stored,
+            frames: room,
+            keypoints,
+        } = loading;
         let source = adapter.adapter.source();
         let features = stored
             .features
@@ -196,11 +210,16 @@ impl RoomLoader {
             known: Vec::new(),
         })?;
 
-        let navigator = Navigator::new(room.clone(), features, adapter.adapter.clone(), self.index)
-            .map_err(|problem| Problem::Navigator {
-                adapter: adapter.name.clone(),
-                problem,
-            })?;
+        let navigator = Navigator::new(
+            (*room).clone(),
+            features,
+            adapter.adapter.clone(),
+            self.index,
+        )
+        .map_err(|problem| Problem::Navigator {
+            adapter: adapter.name.clone(),
+            problem,
+        })?;
         log_audit(&navigator, &adapter.name);
 
         let navigator = Arc::new(navigator);
@@ -227,6 +246,7 @@ impl RoomLoader {
             content: Content::of(&navigator),
             trained_on,
             reader,
+            keypoints: keypoints.cloned(),
             tracking_reader,
             room_revision: stored.revision,
             adapter: adapter.clone(),

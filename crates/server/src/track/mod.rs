@@ -5,6 +5,7 @@
 //! [`Session`] on a worker thread.
 
 mod configuration;
+mod keypoints;
 mod sealed;
 mod sensors;
 mod session;

@@ -10,6 +10,7 @@ use super::super::relocalization::maps;
 use super::super::snapshot::{ServedNavigator, Snapshot};
 use super::Overtaken;
 use super::configuration::{StreamFrames, back_pressure, rooms, settings};
+use super::keypoints::StreamCamera;
 use super::sealed::Sealed;
 use super::sensors::Sensors;
 use super::token::TokenKey;
@@ -32,6 +33,7 @@ pub struct Session {
     config: pb::TrackConfig,
     frames: StreamFrames,
     sensors: Sensors,
+    camera: StreamCamera,
     state: State,
     key: TokenKey,
 }
@@ -151,6 +153,7 @@ impl Session {
 
         let frames = StreamFrames::of(&config)?;
         let sensors = Sensors::of(&config, &frames)?;
+        let camera = StreamCamera::of(&config)?;
         back_pressure(config.back_pressure)?;
 
         // The pose is in a room's world frame, so it needs `room`.
@@ -184,6 +187,7 @@ impl Session {
             config,
             frames,
             sensors,
+            camera,
             state,
             key: key.clone(),
         })
@@ -357,8 +361,25 @@ impl Session {
             adapter: &self.served[0].adapter,
             snapshot: &self.encoders,
             frames: StoredFrames::Refused,
+            detector: None,
         };
         embedder.embed(field, view)
+    }
+
+    /// Encodes the view of the stream's own camera, with the keypoints of an image if a room has
+    /// some and this server can detect them.
+    fn encoded_own_view(&self, view: Option<pb::View>) -> Result<EmbeddedView, Error> {
+        let sources = self.served.iter();
+        let sources = sources.filter_map(|served| Some(&served.keypoints.as_ref()?.source));
+        let embedder = ViewEmbedder {
+            adapter: &self.served[0].adapter,
+            snapshot: &self.encoders,
+            frames: StoredFrames::Refused,
+            detector: sources
+                .filter_map(|source| self.encoders.keypoint_encoder(source))
+                .next(),
+        };
+        embedder.embed("frame.view", view)
     }
 
     /// Encodes the views of a frame's other cameras.
@@ -381,6 +402,7 @@ impl Session {
                 latent,
                 feature,
                 is_blank,
+                keypoints: _,
             } = self.encoded_view(&format!("{field}.view"), given.view)?;
             seen.push(OtherView {
                 camera: camera.number,
@@ -421,9 +443,15 @@ impl Session {
             latent,
             feature,
             is_blank,
-        } = self
-            .encoded_view("frame.view", view)
-            .map_err(refused(Reason::View))?;
+            keypoints,
+        } = self.encoded_own_view(view).map_err(refused(Reason::View))?;
+        let matched = match keypoints {
+            Some(image) if !is_blank => self
+                .camera
+                .matched("frame.view.image", image, &self.served, self.state.room)
+                .map_err(refused(Reason::View))?,
+            _ => None,
+        };
         let other_views = self
             .encoded_other_views(other_views)
             .map_err(refused(Reason::View))?;
@@ -441,6 +469,7 @@ impl Session {
             sequence,
             latent,
             feature,
+            matched,
             is_blank,
             measured,
             gravity,
