@@ -120,7 +120,7 @@ impl FeatureRow {
 
 /// The camera of the images of a request.
 #[derive(Debug, Clone, Copy)]
-enum ViewCamera {
+pub enum ViewCamera {
     Stated(CameraOption),
     Mapping,
 }
@@ -137,7 +137,7 @@ impl FromStr for ViewCamera {
 }
 
 impl ViewCamera {
-    fn to_wire(self) -> pb::ViewCamera {
+    pub fn to_wire(self) -> pb::ViewCamera {
         use pb::view_camera::Camera;
 
         let camera = match self {

@@ -9,7 +9,8 @@ use anyhow::{Context, bail};
 use clap::Args;
 use tokio_stream::wrappers::ReceiverStream;
 
-use crate::ask::{Server, wire_json};
+use crate::ask::{Server, ViewCamera, wire_json};
+use crate::camera::CAMERA_FORM;
 use crate::output::{JsonOutput, check_writable, say, write_file};
 use crate::progress::bar;
 use seese3_client::convert;
@@ -41,6 +42,10 @@ pub struct Track {
     /// have been started with --encoder
     #[arg(long, value_name = "FOLDER", conflicts_with = "feature")]
     images: Option<PathBuf>,
+    /// Camera of --images, as --camera of `seese3 import`, or "mapping" for the camera that mapped the
+    /// room. In a room with keypoints, the focal length of an unknown camera is estimated
+    #[arg(long, value_name = CAMERA_FORM, requires = "images")]
+    camera: Option<ViewCamera>,
     /// First frame to send, counted from 0
     #[arg(long, default_value_t = 0)]
     from: usize,
@@ -54,7 +59,7 @@ pub struct Track {
     #[arg(long)]
     no_fusion: bool,
     /// Continue an earlier stream from the resume token in this file, which --save-token wrote
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["room", "adapter", "no_fusion"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["room", "adapter", "no_fusion", "camera"])]
     resume: Option<PathBuf>,
     /// Write the resume token of the last answer to this file
     #[arg(long, value_name = "FILE")]
@@ -264,7 +269,17 @@ impl Track {
             pb::Fusion::Anchors
         };
 
+        use pb::view_camera::Camera;
+        let camera = self.camera.and_then(|camera| camera.to_wire().camera);
+        let (camera, mapping_camera) = match camera {
+            Some(Camera::Intrinsics(camera)) => (Some(camera), false),
+            Some(Camera::MappingCamera(_)) => (None, true),
+            None => (None, false),
+        };
+
         Ok(pb::TrackConfig {
+            camera,
+            mapping_camera,
             room: self.room.clone().unwrap_or_default(),
             adapter: self.adapter.clone().unwrap_or_default(),
             fusion: fusion as i32,

@@ -184,7 +184,9 @@ class TrackConfig:
     token_every: int = 1
     """Which answers bring the token by which a cut stream resumes: every n-th."""
     base_from_camera: npt.ArrayLike | None = None
-    camera: Camera | None = None
+    camera: Camera | str | None = None
+    """The camera, or "mapping" for the one that mapped the rooms. In a room with keypoints, the focal length of an
+    unknown camera is estimated from the first images."""
     gravity_in_map: npt.ArrayLike | None = None
     other_cameras: Sequence[RigCamera] = ()
 
@@ -200,6 +202,7 @@ class TrackConfig:
             odometry_pb2.RigCamera(name=other.name, pose=wire_pose(other.pose), camera=wire_camera(other.camera))
             for other in self.other_cameras
         ]
+        camera = wire_view_camera(self.camera)
         pressure = odometry_pb2.BACK_PRESSURE_NEWEST if self.newest_only else odometry_pb2.BACK_PRESSURE_UNSPECIFIED
         return odometry_pb2.TrackConfig(
             room=self.room,
@@ -211,7 +214,8 @@ class TrackConfig:
             back_pressure=pressure,
             token_every=self.token_every,
             base_from_camera=None if self.base_from_camera is None else wire_pose(self.base_from_camera),
-            camera=wire_camera(self.camera),
+            camera=camera.intrinsics if camera is not None and camera.HasField("intrinsics") else None,
+            mapping_camera=camera is not None and camera.mapping_camera,
             gravity_in_map=None if self.gravity_in_map is None else wire_vector(self.gravity_in_map),
             other_cameras=others,
         )
