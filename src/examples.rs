@@ -49,6 +49,7 @@ encoders
   seese3 encoders dinov2-b
 studio
   seese3 studio --rooms 20 --frames 400 --seed 7 --out suite --keep-images
+  seese3 studio --suite returns --rooms 3 --frames 600 --out returns --encode pixels
 train
   seese3 train --store store --room kitchen --features pixels --stride 20 --split blocks
   seese3 train --store suite --room 'studio7-000*' --preset steady --split whole --calibrate-on 'studio7-001*' --name robot

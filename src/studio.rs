@@ -43,14 +43,14 @@ pub struct Studio {
     /// Kind of rooms and of their recordings
     #[arg(long, default_value = "visits", value_parser = one_of::<Suite>())]
     suite: Suite,
-    /// Variations that are turned off in the suite `visits`, separated by commas, for ablations;
-    /// the poses stay the same
+    /// Variations that are turned off in the suites `visits` and `returns`, separated by commas, for
+    /// ablations; the poses stay the same
     #[arg(long, value_delimiter = ',', value_name = "VARIATIONS", value_parser = one_of::<Variation>())]
     without: Vec<Variation>,
     /// Number of rooms, 1 to 100000
     #[arg(long, default_value_t = 131, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     rooms: u32,
-    /// Number of frames per room, 2 to 100000; if omitted, 1000 for visits and 400 for walks
+    /// Number of frames per room, 2 to 100000; if omitted, 1000, and 400 for walks
     #[arg(long, value_parser = clap::value_parser!(u32).range(2..=100_000))]
     frames: Option<u32>,
     /// Seed of the suite; the same seed gives the same rooms
@@ -93,7 +93,7 @@ impl Studio {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
         if self.suite == Suite::Walks && !self.without.is_empty() {
-            bail!("--without needs --suite visits: walks have no variations");
+            bail!("--without needs --suite visits or returns: walks have no variations");
         }
         if let Some(file) = &self.sheet {
             return self.sheet(file);
@@ -231,7 +231,7 @@ impl Studio {
 
     fn frame_count(&self) -> usize {
         let default = match self.suite {
-            Suite::Visits => 1_000,
+            Suite::Visits | Suite::Returns => 1_000,
             Suite::Walks => 400,
         };
         self.frames.unwrap_or(default) as usize

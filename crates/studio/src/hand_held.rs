@@ -71,8 +71,8 @@ impl Goals {
         }
     }
 
-    /// `frame_count` poses of one visit, `world_from_camera`, metres.
-    pub fn visit(&self, frame_count: usize, random: &mut ChaCha8Rng) -> Vec<Pose> {
+    /// The path of one visit.
+    pub fn path(&self, frame_count: usize, random: &mut ChaCha8Rng) -> HandPath {
         let habit = &self.habit;
         let low = habit.middle - habit.reach;
         let high = habit.middle + habit.reach;
@@ -98,20 +98,159 @@ impl Goals {
             habit.roll * deviation::<1>(random)
         });
 
-        // Tremor of the hand: position in metres, then yaw, pitch and roll in radians.
+        HandPath {
+            positions,
+            views,
+            rolls,
+        }
+    }
+}
+
+/// A path of the hand without its tremor, one entry per frame.
+#[derive(Debug, Clone)]
+pub(super) struct HandPath {
+    /// Metres.
+    positions: Vec<SVector<f64, 3>>,
+    /// Yaw and pitch, radians.
+    views: Vec<SVector<f64, 2>>,
+    /// Radians.
+    rolls: Vec<SVector<f64, 1>>,
+}
+
+impl HandPath {
+    /// Whether the path has no frames.
+    pub fn is_empty(&self) -> bool {
+        self.positions.is_empty()
+    }
+
+    /// The poses with the tremor of the hand, `world_from_camera`, metres.
+    pub fn poses(&self, random: &mut ChaCha8Rng) -> Vec<Pose> {
+        // Position in metres, then yaw, pitch and roll in radians.
         let tremor: [Tremor; 6] =
             std::array::from_fn(|axis| Tremor::new(if axis < 3 { 0.005 } else { 0.006 }, random));
 
-        (0..frame_count)
+        (0..self.positions.len())
             .map(|frame| {
                 let shaken = |axis: usize| tremor[axis].at(frame);
-                let at = positions[frame] + Vector3::from_fn(|axis, _| shaken(axis));
-                let [yaw, pitch] = [views[frame][0] + shaken(3), views[frame][1] + shaken(4)];
+                let at = self.positions[frame] + Vector3::from_fn(|axis, _| shaken(axis));
+                let view = self.views[frame];
+                let [yaw, pitch] = [view[0] + shaken(3), view[1] + shaken(4)];
 
-                posed(at, looking(yaw, pitch, rolls[frame][0] + shaken(5)))
+                posed(at, looking(yaw, pitch, self.rolls[frame][0] + shaken(5)))
             })
             .collect()
     }
+
+    /// A later visit that follows this path for the most part: at other speeds, in stretches
+    /// forward and backward, beside it and with other views. Positions stay between the corners
+    /// `bounds`, metres. This path must not be empty.
+    pub fn followed(
+        &self,
+        frame_count: usize,
+        bounds: [Vector3<f64>; 2],
+        random: &mut ChaCha8Rng,
+    ) -> Self {
+        let places = places_on(self.positions.len(), frame_count, random);
+        let beside = strokes(frame_count, BESIDE_SPEED, 1.0, random, |_, random| {
+            let [low, high] = if random.random_bool(ASIDE) {
+                [NEAR_M, FAR_M]
+            } else {
+                [0.0, NEAR_M]
+            };
+            let (sine, cosine) = random.random_range(0.0..std::f64::consts::TAU).sin_cos();
+            SVector::from([cosine, sine]) * random.random_range(low..high)
+        });
+        let turned = strokes(frame_count, TURN_SPEED, 1.0, random, |_, random| {
+            let usual: SVector<f64, 2> = TURN_RAD * deviation(random);
+            let side = random.random_range(ELSEWHERE_RAD[0]..ELSEWHERE_RAD[1]);
+            match random.random_range(0.0..1.0) {
+                share if share < ASIDE / 2.0 => usual + SVector::from([side, 0.0]),
+                share if share < ASIDE => usual - SVector::from([side, 0.0]),
+                _ => usual,
+            }
+        });
+
+        let [low, high] = bounds;
+        let position = |frame: usize| {
+            let offset = Vector3::new(beside[frame][0], beside[frame][1], 0.0);
+            let at = between(&self.positions, places[frame]) + offset;
+            at.zip_zip_map(&low, &high, |at, low, high| at.clamp(low, high))
+        };
+        Self {
+            positions: (0..frame_count).map(position).collect(),
+            views: (0..frame_count)
+                .map(|frame| between(&self.views, places[frame]) + turned[frame])
+                .collect(),
+            rolls: places
+                .iter()
+                .map(|&place| between(&self.rolls, place))
+                .collect(),
+        }
+    }
+}
+
+/// Largest offset from a followed path, metres, and the largest one where the path is left.
+const NEAR_M: f64 = 0.3;
+const FAR_M: f64 = 0.8;
+/// Standard deviation of the difference of views along a followed path, radians.
+const TURN_RAD: f64 = 0.1;
+/// Range of the difference in yaw where a person looks elsewhere, radians.
+const ELSEWHERE_RAD: [f64; 2] = [0.4, 1.2];
+/// Share of the offsets, and of the views, that leave the followed path.
+const ASIDE: f64 = 0.2;
+/// Mean speeds at which offset and view change: metres and radians per second.
+const BESIDE_SPEED: f64 = 0.15;
+const TURN_SPEED: f64 = 0.3;
+/// Range of the speed along a followed path, in speeds of the first visit.
+const PACE: [f64; 2] = [0.5, 1.2];
+/// Range of the length of a stretch in one direction, frames.
+const STRETCH: [usize; 2] = [60, 180];
+/// Share of the stretches that are walked backward.
+const BACKWARD: f64 = 0.3;
+/// A change of speed takes twice this number of frames.
+const SMOOTHED: usize = 8;
+
+/// `frame_count` places on a path of `length` frames, in frames: stretches forward and backward,
+/// each at a constant speed.
+fn places_on(length: usize, frame_count: usize, random: &mut ChaCha8Rng) -> Vec<f64> {
+    let last = length.saturating_sub(1) as f64;
+    let mut at = last * random.random_range(0.0..0.3);
+    let mut places = Vec::with_capacity(frame_count);
+
+    while places.len() < frame_count {
+        let frames = random.random_range(STRETCH[0]..STRETCH[1]);
+        let pace = random.random_range(PACE[0]..PACE[1]);
+        let step = if random.random_bool(BACKWARD) {
+            -pace
+        } else {
+            pace
+        };
+
+        // Turn round where the path would end.
+        let is_inside = (0.0..=last).contains(&(at + step * frames as f64));
+        let step = if is_inside { step } else { -step };
+        for _ in 0..frames {
+            places.push(at);
+            at = (at + step).clamp(0.0, last);
+        }
+    }
+    places.truncate(frame_count);
+
+    // A mean of neighbors rounds off the changes of speed, and stays on the path.
+    (0..frame_count)
+        .map(|frame| {
+            let end = (frame + SMOOTHED + 1).min(frame_count);
+            let near = &places[frame.saturating_sub(SMOOTHED)..end];
+            near.iter().sum::<f64>() / near.len() as f64
+        })
+        .collect()
+}
+
+/// The value at a place between two frames.
+fn between<const N: usize>(values: &[SVector<f64, N>], place: f64) -> SVector<f64, N> {
+    let before = place.floor() as usize;
+    let after = (before + 1).min(values.len() - 1);
+    values[before].lerp(&values[after], place.fract())
 }
 
 /// The nearer of two random goals, plus noise of standard deviation `miss`. Nearby goals are more

@@ -2,9 +2,10 @@
 
 use strum::{EnumMessage, EnumString, IntoStaticStr, VariantArray};
 
+use super::SuiteRoom;
 use super::film::Film;
 use super::render::Camera;
-use super::{SuiteRoom, visits};
+use super::visits::{self, SecondVisit};
 
 /// A suite of rooms, with a style of images and of camera motion.
 #[derive(
@@ -17,6 +18,12 @@ pub enum Suite {
     ///
     /// Objects move between visits, and people walk by.
     Visits,
+    /// The suite `visits`, but the second visit follows the path of the first for the most part.
+    ///
+    /// It goes at other speeds, in stretches forward and backward, up to 0.3 m beside the path, and
+    /// looks elsewhere at times: about half of its views have a view of the first visit within
+    /// 0.25 m and 15°.
+    Returns,
     /// One smooth walk per room, plain images: the hard class.
     ///
     /// The walk hardly covers what its last fifth sees.
@@ -27,7 +34,8 @@ impl Suite {
     /// The recording of room `number` of the suite with `seed`. Rooms do not depend on each other.
     pub fn film(self, seed: u64, number: u32, frame_count: usize) -> Film {
         match self {
-            Self::Visits => visits::film(seed, number, frame_count),
+            Self::Visits => visits::film(seed, number, frame_count, SecondVisit::Independent),
+            Self::Returns => visits::film(seed, number, frame_count, SecondVisit::Returning),
             Self::Walks => {
                 let room = SuiteRoom::new(seed, number);
                 let poses = room.path(frame_count);

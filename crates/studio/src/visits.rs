@@ -1,4 +1,4 @@
-//! The suite of visits: cluttered rooms, each filmed twice with a hand-held camera in different
+//! The suites of visits: cluttered rooms, each filmed twice with a hand-held camera in different
 //! light.
 
 use nalgebra::{Isometry3, Point3, Vector3};
@@ -6,7 +6,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::film::{Film, PasserBy, Visit};
-use super::hand_held::{Goals, Habit};
+use super::hand_held::{Goals, Habit, HandPath};
 use super::photograph::Shot;
 use super::solid::Solid;
 use super::suite::{decorate, room_size};
@@ -32,9 +32,19 @@ enum Tour {
     Corridor,
 }
 
+/// How the second visit to a room moves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum SecondVisit {
+    /// Between the standpoints and views of the first visit, on a path of its own.
+    Independent,
+    /// Along the path of the first visit for the most part.
+    Returning,
+}
+
 /// The recording of room `number` of the suite with `seed`. On average, of twenty rooms nine are
-/// partial tours, seven are whole rooms and four are corridors.
-pub(super) fn film(seed: u64, number: u32, frame_count: usize) -> Film {
+/// partial tours, seven are whole rooms and four are corridors. Only the path of the second visit
+/// depends on `second`.
+pub(super) fn film(seed: u64, number: u32, frame_count: usize, second: SecondVisit) -> Film {
     // Use other random streams than the suite of walks.
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     random.set_stream((1 << 32) + u64::from(number));
@@ -56,21 +66,42 @@ pub(super) fn film(seed: u64, number: u32, frame_count: usize) -> Film {
     let field_of_view_rad = random.random_range(55f64..80.0).to_radians();
 
     let mut poses = Vec::with_capacity(frame_count);
+    let mut first_path: Option<HandPath> = None;
     let mut visits = Vec::new();
     let mut scenes = Vec::new();
     for visit in 0..VISITS {
         let begin = frame_count * visit / VISITS;
         let frames = frame_count * (visit + 1) / VISITS - begin;
 
-        poses.extend(goals.visit(frames, &mut random));
+        let path = goals.path(frames, &mut random);
+        let own_poses = path.poses(&mut random);
+        let followed = match second {
+            SecondVisit::Independent => None,
+            SecondVisit::Returning => first_path.as_ref().filter(|path| !path.is_empty()),
+        };
+        poses.extend(match followed {
+            None => own_poses,
+            Some(first) => {
+                // A stream of its own, so that what is drawn next does not depend on the path.
+                let mut random = ChaCha8Rng::seed_from_u64(seed);
+                random.set_stream((2 << 32) + u64::from(number));
+                let path = first.followed(frames, walkable(size), &mut random);
+                path.poses(&mut random)
+            }
+        });
+        first_path.get_or_insert(path);
+
         visits.push(visited(&scene, begin, frames, &mut random));
         scenes.push(changed(&scene, visit > 0, &mut random));
     }
 
-    let kind = match tour {
-        Tour::Part => "part",
-        Tour::Room => "room",
-        Tour::Corridor => "corridor",
+    let kind = match (second, tour) {
+        (SecondVisit::Independent, Tour::Part) => "part",
+        (SecondVisit::Independent, Tour::Room) => "room",
+        (SecondVisit::Independent, Tour::Corridor) => "corridor",
+        (SecondVisit::Returning, Tour::Part) => "returning part",
+        (SecondVisit::Returning, Tour::Room) => "returning room",
+        (SecondVisit::Returning, Tour::Corridor) => "returning corridor",
     };
 
     Film {
@@ -111,7 +142,7 @@ fn furnished(walk: Walk, size: Vector3<f64>, random: &mut ChaCha8Rng) -> Scene {
 /// Reference for partial tours: the camera in the kitchen of 7-Scenes moves by 0.14 m and 7° in 20
 /// frames. Tours of whole rooms rotate faster.
 fn habit(tour: Tour, size: Vector3<f64>, random: &mut ChaCha8Rng) -> Habit {
-    let free = (size / 2.0 - Vector3::repeat(CLEARANCE_M)).map(|reach| reach.max(0.15));
+    let free = free(size);
     let mut up_to = |low: f64, high: f64, free: f64| random.random_range(low..high).min(free);
 
     let mut reach = match tour {
@@ -164,6 +195,18 @@ fn habit(tour: Tour, size: Vector3<f64>, random: &mut ChaCha8Rng) -> Habit {
         turning: turning.to_radians(),
         rest: random.random_range(0.3..1.2),
     }
+}
+
+/// Maximum offset of a standpoint from the middle of a room, metres.
+fn free(size: Vector3<f64>) -> Vector3<f64> {
+    (size / 2.0 - Vector3::repeat(CLEARANCE_M)).map(|reach| reach.max(0.15))
+}
+
+/// Opposite corners of the box that standpoints are in; all heights.
+fn walkable(size: Vector3<f64>) -> [Vector3<f64>; 2] {
+    let mut free = free(size);
+    free.z = f64::INFINITY;
+    [size / 2.0 - free, size / 2.0 + free]
 }
 
 /// The room as it is during one visit, with random light. If `moved`, about a quarter of the small
@@ -296,12 +339,15 @@ fn passer_by(scene: &Scene, begin: usize, frames: usize, random: &mut ChaCha8Rng
 #[cfg(test)]
 mod tests {
     use super::*;
+    use seese3_core::geometry::Pose;
+
+    const BOTH: [SecondVisit; 2] = [SecondVisit::Independent, SecondVisit::Returning];
 
     /// Oracle: geometry. A camera keeps 20 cm from the walls and 5 cm from every box.
     #[test]
     fn the_camera_keeps_clear_of_walls_and_furniture() {
-        for number in 0..60 {
-            let film = film(7, number, 400);
+        for (number, second) in (0..60).flat_map(|number| BOTH.map(|second| (number, second))) {
+            let film = film(7, number, 400, second);
             for (frame, pose) in film.poses.iter().enumerate() {
                 let scene = &film.scenes[usize::from(frame >= 200)];
                 let at = Point3::from(pose.translation.vector);
@@ -333,7 +379,7 @@ mod tests {
         let mut away = Vec::new();
 
         for number in 0..40 {
-            let film = film(11, number, 1_000);
+            let film = film(11, number, 1_000, SecondVisit::Independent);
             let apart = |a: usize, b: usize| {
                 let step = film.poses[a].inv_mul(&film.poses[b]);
                 (step.translation.vector.norm(), step.rotation.angle())
@@ -372,5 +418,77 @@ mod tests {
             "{turned:?}"
         );
         assert!((0.15..0.5).contains(&median(&away)), "{away:?}");
+    }
+
+    /// Share of the second visit's views with a view of the first visit within 0.25 m and 15°.
+    fn share_near(film: &Film) -> f64 {
+        let (first, second) = film.poses.split_at(film.visits[1].begin);
+        let is_near = |pose: &&Pose| {
+            first.iter().any(|other| {
+                let apart = other.inv_mul(pose);
+                apart.translation.vector.norm() <= 0.25
+                    && apart.rotation.angle() <= 15_f64.to_radians()
+            })
+        };
+        second.iter().filter(is_near).count() as f64 / second.len() as f64
+    }
+
+    /// Oracle: the definition of a return. On average 40 to 70 % of the second visit's views are
+    /// near a view of the first visit, and 20 to 90 % in four of five rooms; a visit on its own path
+    /// has fewer. Else the suites are the same: the first visits, light and cameras.
+    #[test]
+    fn who_returns_sees_about_half_of_the_views_again() {
+        let mut shares = [Vec::new(), Vec::new()];
+        for number in 0..40 {
+            let films = BOTH.map(|second| film(11, number, 600, second));
+            for (shares, film) in shares.iter_mut().zip(&films) {
+                shares.push(share_near(film));
+            }
+
+            let [own, returning] = films;
+            assert_eq!(own.poses[..300], returning.poses[..300], "room {number}");
+            assert_ne!(own.poses[300..], returning.poses[300..], "room {number}");
+            let settings = |film: &Film| format!("{:?} {:?}", film.visits, film.scenes[1].light);
+            assert_eq!(settings(&own), settings(&returning), "room {number}");
+        }
+
+        let mean = |shares: &[f64]| shares.iter().sum::<f64>() / shares.len() as f64;
+        let [own, returning] = [&shares[0], &shares[1]];
+        let usual = returning
+            .iter()
+            .filter(|share| (0.2..0.9).contains(*share))
+            .count();
+        assert!((0.4..0.7).contains(&mean(returning)), "{returning:?}");
+        assert!(usual >= 32, "{returning:?}");
+        assert!(
+            mean(own) < mean(returning) - 0.1,
+            "{} and {}",
+            mean(own),
+            mean(returning)
+        );
+    }
+
+    /// Oracle: a hand moves by less than 7 cm and 6° a frame, and the definition of a seed. The
+    /// shortest recordings have one frame a visit, or none.
+    #[test]
+    fn a_return_moves_as_people_do_and_depends_on_its_seed_alone() {
+        for number in 0..20 {
+            let film = |seed| film(seed, number, 400, SecondVisit::Returning);
+            let [one, again, other] = [5, 5, 6].map(film);
+            assert_eq!(one.poses, again.poses);
+            assert_ne!(one.poses[200..], other.poses[200..]);
+
+            for frame in 201..400 {
+                let step = one.poses[frame - 1].inv_mul(&one.poses[frame]);
+                let metres = step.translation.vector.norm();
+                let angle = step.rotation.angle().to_degrees();
+                assert!(metres < 0.07 && angle < 6.0, "room {number}, frame {frame}");
+            }
+        }
+
+        for frames in [1, 2, 3] {
+            let film = film(5, 0, frames, SecondVisit::Returning);
+            assert_eq!(film.poses.len(), frames);
+        }
     }
 }
