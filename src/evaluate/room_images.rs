@@ -3,8 +3,10 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
+use strum::VariantArray;
 
 use super::super::encode::images_root;
+use seese3_core::geometry::Pose;
 use seese3_core::image::RgbImage;
 use seese3_core::room::Room;
 use seese3_encoder::read_image;
@@ -52,27 +54,28 @@ impl<'a> RoomImages<'a> {
     }
 }
 
-/// The film of a room that `seese3 studio` drew, by its name and format; `None` if the room is not
-/// one, or if its poses are not those of the film.
+/// The film of a room that `seese3 studio` drew, by its name, format and poses; `None` if the room is
+/// not one.
 fn film(room: &Room) -> Option<Film> {
     let (seed, number) = room.id().as_str().strip_prefix("studio")?.split_once('-')?;
+    let seed = seed.parse().ok()?;
+    let number = number.parse().ok()?;
     let format = room.provenance().format.strip_prefix("studio ")?;
-    let mut words = format.split(" without ");
-    let suite: Suite = words.next()?.parse().ok()?;
-    let without = words.map(str::parse).collect::<Result<Vec<Variation>, _>>();
+    let mut parts = format.split(" without ");
+    let kind = parts.next()?;
+    let without: Vec<Variation> = parts.map(str::parse).collect::<Result<_, _>>().ok()?;
 
-    let film = suite.film(seed.parse().ok()?, number.parse().ok()?, room.frame_count());
-    let film = without
-        .ok()?
-        .into_iter()
-        .fold(film, |film, variation| film.without(variation));
-    let is_same = film.poses.len() == room.frame_count()
-        && film
-            .poses
-            .iter()
-            .zip(room.poses())
-            .all(|(a, b)| (a.to_homogeneous() - b.to_homogeneous()).amax() < 1e-9);
-    is_same.then_some(film)
+    let film = Suite::VARIANTS
+        .iter()
+        .map(|suite| suite.film(seed, number, room.frame_count()))
+        .find(|film| film.kind == kind && has_poses(room, &film.poses))?;
+    Some(without.into_iter().fold(film, Film::without))
+}
+
+/// Whether these are the poses of the room, up to 1e-9 in each entry of the homogeneous matrices.
+fn has_poses(room: &Room, poses: &[Pose]) -> bool {
+    let is_near = |(a, b): (&Pose, &Pose)| (a.to_homogeneous() - b.to_homogeneous()).amax() < 1e-9;
+    poses.len() == room.frame_count() && poses.iter().zip(room.poses()).all(is_near)
 }
 
 /// The model of a room's keypoints: the given file, or the one that the room was encoded with.
@@ -86,4 +89,40 @@ pub fn keypoint_model(given: Option<&Path>, recorded: &str) -> anyhow::Result<Pa
     }
     file.canonicalize()
         .with_context(|| file.display().to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use seese3_core::room::{Frames, Provenance, RoomId};
+
+    /// A room with the frames of a film, as `seese3 studio` names it.
+    fn drawn(film: &Film, format: String) -> Room {
+        let frames = Frames {
+            poses: film.poses.clone(),
+            ..Frames::default()
+        };
+        let provenance = Provenance {
+            format,
+            ..Provenance::default()
+        };
+        Room::new(RoomId::new("studio5-0003").unwrap(), frames, provenance).unwrap()
+    }
+
+    /// Oracle: the film itself, and that a room with another pose is not the film's.
+    #[test]
+    fn rooms_of_every_suite_are_drawn_again() {
+        let size = (32, 24);
+        for suite in Suite::VARIANTS {
+            let film = suite.film(5, 3, 6).without(Variation::Light);
+            let room = drawn(&film, format!("studio {} without light", film.kind));
+            let images = RoomImages::of(&room, None, size).unwrap();
+            assert_eq!(images.image(4).unwrap(), film.image(4, 32, 24), "{suite:?}");
+
+            let mut moved = film.clone();
+            moved.poses[5].translation.vector.x += 1e-6;
+            let other = drawn(&moved, room.provenance().format.clone());
+            assert!(RoomImages::of(&other, None, size).is_err(), "{suite:?}");
+        }
+    }
 }
