@@ -61,6 +61,7 @@ evaluate
   seese3 evaluate odometry --store store --room kitchen --adapter robot --hold-out blocks
 evaluate localization
   seese3 evaluate localization --store store --room kitchen --fit --map-blocks
+  seese3 evaluate localization --store store --room kitchen --peer python3 --peer-every 10
 evaluate motion
   seese3 evaluate motion --store store --room kitchen --adapter robot --stride 5
 evaluate odometry

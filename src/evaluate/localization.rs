@@ -9,12 +9,15 @@ use clap::Args;
 use seese3_core::cancel::Cancellation;
 use seese3_core::eval::has_seen;
 use seese3_core::features::Features;
-use seese3_core::room::FrameId;
+use seese3_core::geometry::CameraIntrinsics;
+use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::HoldOut;
 use seese3_core::training::RoomData;
 use seese3_lab::experiments::check_hold_out;
 use seese3_lab::experiments::localization::{LocalizationProtocol, RuleScores, evaluate};
-use seese3_lab::experiments::matched_localization::{self, MappedAndAsked, MatchedLocalization};
+use seese3_lab::experiments::matched_localization::{
+    self, MappedAndAsked, MatchedLocalization, PeerAnswer,
+};
 use seese3_lab::report::{
     LocalizationContext, LocalizationJson, localization_table, matched_localization_table,
 };
@@ -25,12 +28,15 @@ use super::super::fit::fitting_bar;
 use super::super::named::one_of;
 use super::super::output::{JsonOutput, say};
 use super::super::progress::bar;
+use super::peer::{Peer, PeerTask};
 use super::room_images::{RoomImages, keypoint_model};
 use seese3_encoder::{Encoded, Encoder, OnBadImage, Task, encode_room};
 use seese3_store::{RoomKeypoints, Store, StoredRoom};
 
 /// Frames per run of the model.
 const BATCH: usize = 8;
+/// Width of images that are drawn for the peer, pixels.
+const PEER_WIDTH: usize = 640;
 
 #[derive(Debug, Args)]
 pub struct Localization {
@@ -67,6 +73,13 @@ pub struct Localization {
     /// Folder of the images; by default that of the import. Rooms of `seese3 studio` are drawn again
     #[arg(long, value_name = "DIR", conflicts_with_all = ["adapter", "fit"])]
     images: Option<PathBuf>,
+    /// Also locate the views by a peer: SIFT features, VLAD, triangulated points and PoseLib's
+    /// absolute pose. PYTHON is an interpreter with numpy, opencv-python-headless and poselib
+    #[arg(long, value_name = "PYTHON", conflicts_with_all = ["adapter", "fit"])]
+    peer: Option<PathBuf>,
+    /// The peer locates one view in this many; the comparison is on these views
+    #[arg(long, value_name = "N", default_value_t = 1, requires = "peer", value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    peer_every: u32,
     /// Seed of the fitted adapter
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
     seed: u64,
@@ -131,6 +144,7 @@ impl Localization {
 
     /// Evaluates matched views.
     async fn evaluate_matched(&self, store: &Store) -> anyhow::Result<()> {
+        let peer = self.peer.as_deref().map(Peer::new).transpose()?;
         let stored = store.load_room(&self.room, None).await?;
         let Some(keypoints) = &stored.keypoints else {
             bail!(
@@ -150,12 +164,22 @@ impl Localization {
             camera: keypoints.map.camera,
         };
 
-        let progress = bar(asked.len() as u64, "localizing");
-        let begun = Instant::now();
         let frames = MappedAndAsked {
             mapped: &mapped,
             asked: &asked,
+            peer: &[],
         };
+        let answers = match &peer {
+            Some(peer) => self.ask(peer, &stored.room, recording.camera, frames)?,
+            None => Vec::new(),
+        };
+        let frames = MappedAndAsked {
+            peer: &answers,
+            ..frames
+        };
+
+        let progress = bar(asked.len() as u64, "localizing");
+        let begun = Instant::now();
         let found = self.runtime.pool()?.install(|| {
             let clock = || begun.elapsed().as_secs_f64();
             matched_localization::evaluate(recording, encoded.rows.view(), frames, &clock, &|| {
@@ -202,6 +226,36 @@ impl Localization {
             .install(|| encode_room(&task, &encoder, None, &told))?;
         progress.finish_and_clear();
         Ok(encoded)
+    }
+
+    /// The peer's answers to every N-th of the asked frames.
+    fn ask(
+        &self,
+        peer: &Peer<'_>,
+        room: &Room,
+        camera: CameraIntrinsics,
+        frames: MappedAndAsked<'_>,
+    ) -> anyhow::Result<Vec<PeerAnswer>> {
+        let height = (PEER_WIDTH as f64 * camera.height()).round() as usize;
+        let images = RoomImages::of(room, self.images.as_deref(), (PEER_WIDTH, height))?;
+        let queries: Vec<FrameId> = frames
+            .asked
+            .iter()
+            .copied()
+            .step_by(self.peer_every as usize)
+            .collect();
+        let task = PeerTask {
+            poses: room.poses(),
+            images: &images,
+            camera,
+            mapped: frames.mapped,
+            queries: &queries,
+        };
+
+        let progress = bar(queries.len() as u64, "localizing by the peer");
+        let answers = peer.locate(&task, &|| progress.inc(1))?;
+        progress.finish_and_clear();
+        Ok(answers)
     }
 
     /// The mapped frames, and the frames that are asked for.

@@ -7,6 +7,7 @@ mod odometry;
 mod planning;
 mod robustness;
 mod room_images;
+mod peer;
 mod trajectory;
 
 use std::ffi::OsStr;

@@ -42,6 +42,16 @@ impl<'a> RoomImages<'a> {
         })
     }
 
+    /// The file of the image of the frame in `row`; `None` if it is drawn, or part of another file.
+    pub fn file(&self, row: usize) -> Option<PathBuf> {
+        match self {
+            Self::Folder { root, images } => {
+                Some(root.join(&images[row])).filter(|file| file.is_file())
+            }
+            Self::Film { .. } => None,
+        }
+    }
+
     /// The image of the frame in `row`.
     pub fn image(&self, row: usize) -> Result<RgbImage, seese3_encoder::Error> {
         match self {
@@ -118,6 +128,7 @@ mod tests {
             let room = drawn(&film, format!("studio {} without light", film.kind));
             let images = RoomImages::of(&room, None, size).unwrap();
             assert_eq!(images.image(4).unwrap(), film.image(4, 32, 24), "{suite:?}");
+            assert!(images.file(4).is_none());
 
             let mut moved = film.clone();
             moved.poses[5].translation.vector.x += 1e-6;

@@ -325,6 +325,10 @@ fn an_adapter_is_fitted_and_its_views_are_located() {
         "evaluate localization --store store --room a",
         &["--adapter", "--fit"],
     );
+    here.refuses(
+        "evaluate localization --store store --room a --peer no-such-python",
+        &["--peer: cannot run no-such-python", "Python interpreter"],
+    );
     here.refuses("fit --store store --room c", &["'c'"]);
 
     // What would be measured too well, or replace another adapter, is refused before it is fitted.

@@ -1,6 +1,8 @@
 //! Evaluates matched views: maps a part of a room's frames with their keypoints, and locates the
 //! views of the others. Beside it, in the same run, the baselines of retrieval.
 
+use std::collections::BTreeMap;
+
 use nalgebra::{Quaternion, UnitQuaternion, Vector3, Vector4};
 use ndarray::{Array2, ArrayView2};
 use rayon::prelude::*;
@@ -9,7 +11,9 @@ use serde::Serialize;
 use seese3_core::geometry::{Pose, PoseError, log};
 use seese3_core::keypoints::Keypoints;
 use seese3_core::room::FrameId;
-use seese3_core::statistics::{Coverage, coverage, root_mean_square};
+use seese3_core::statistics::{
+    Coverage, RecordedMedian, coverage, median_of_recording, root_mean_square,
+};
 use seese3_robot::localization::{KeypointRoom, NotLocated};
 use seese3_robot::matched_views::{Mapping, MappingParameters, TrialRecording, ViewKeypoints};
 
@@ -38,6 +42,37 @@ pub struct MatchedPart {
     pub nearest_frame: LocalizationErrors,
     /// Weighted mean of the three most similar frames.
     pub blend: LocalizationErrors,
+    /// Comparison with a peer; absent if it was asked for none of these views.
+    pub peer: Option<PeerComparison>,
+}
+
+/// Matched views and a peer, on the views that the peer was asked for.
+#[derive(Debug, Clone, Serialize)]
+pub struct PeerComparison {
+    /// Number of views.
+    pub n: usize,
+    /// The answers of the peer.
+    #[serde(flatten)]
+    pub peer: Answered,
+    /// Matched views.
+    pub ours: Answered,
+    /// Comparison on the views that both answer; absent without any.
+    pub both: Option<PairedErrors>,
+}
+
+/// Errors of matched views and of a peer on the same views.
+#[derive(Debug, Clone, Serialize)]
+pub struct PairedErrors {
+    /// Number of views.
+    pub n: usize,
+    /// Matched views.
+    pub ours: LocalizationErrors,
+    /// The peer.
+    pub peer: LocalizationErrors,
+    /// Our translation error minus the peer's, meters: the median over the views.
+    pub difference_m: RecordedMedian,
+    /// Share of the views with the smaller translation error by matched views.
+    pub ours_nearer: f64,
 }
 
 /// Errors of the answered views.
@@ -52,9 +87,10 @@ pub struct Answered {
     pub rmse_m: f64,
     /// Share of the answers that are more than 0.2 m or 10° off.
     pub wrong: f64,
-    /// Shares of the errors within the 68 % and 95 % ellipsoids.
+    /// Shares of the errors within the 68 % and 95 % ellipsoids; absent for a peer, which states no
+    /// covariance.
     #[serde(flatten)]
-    pub coverage: Coverage,
+    pub coverage: Option<Coverage>,
 }
 
 /// The localization of a room's held-out views.
@@ -81,10 +117,22 @@ pub struct MappedAndAsked<'a> {
     pub mapped: &'a [FrameId],
     /// Query frames; none of them is mapped.
     pub asked: &'a [FrameId],
+    /// Answers of a peer to some of the query frames; empty without a peer.
+    pub peer: &'a [PeerAnswer],
+}
+
+/// A peer's answer to a query frame.
+#[derive(Debug, Clone, Copy)]
+pub struct PeerAnswer {
+    /// The query frame.
+    pub frame: FrameId,
+    /// `world_from_camera`, meters; `None` if the peer refused the view.
+    pub pose: Option<Pose>,
 }
 
 /// A located or refused view.
 struct View {
+    frame: FrameId,
     truth: Pose,
     located: Result<Located, NotLocated>,
     nearest: Pose,
@@ -103,7 +151,8 @@ struct Located {
 /// rayon pool. The baselines retrieve frames by `features`, shape (n, d). `clock` gives seconds; `done` is called after each view.
 ///
 /// # Errors
-/// [`Error::Input`] if no frame is mapped or asked for, or if no mapped frame has a keypoint.
+/// [`Error::Input`] if no frame is mapped or asked for, if no mapped frame has a keypoint, or if a
+/// peer answers a frame that is not asked for.
 pub fn evaluate(
     recording: TrialRecording<'_>,
     features: ArrayView2<'_, f32>,
@@ -111,12 +160,22 @@ pub fn evaluate(
     clock: &(dyn Fn() -> f64 + Sync),
     done: &(dyn Fn() + Sync),
 ) -> Result<MatchedLocalization, Error> {
-    let MappedAndAsked { mapped, asked } = frames;
+    let MappedAndAsked {
+        mapped,
+        asked,
+        peer,
+    } = frames;
     if mapped.is_empty() || asked.is_empty() {
         return Err(Error::Input(format!(
             "{} frames are mapped and {} asked for; both must be above 0",
             mapped.len(),
             asked.len()
+        )));
+    }
+    if let Some(answer) = peer.iter().find(|answer| !asked.contains(&answer.frame)) {
+        return Err(Error::Input(format!(
+            "the peer answers frame {}, which is not asked for",
+            answer.frame.row()
         )));
     }
 
@@ -125,21 +184,25 @@ pub fn evaluate(
     let views: Vec<View> = asked
         .par_iter()
         .map(|frame| {
-            let view = located(recording, &room, &baselines, frame.row(), clock);
+            let view = located(recording, &room, &baselines, *frame, clock);
             done();
             view
         })
         .collect();
 
+    let answers: BTreeMap<FrameId, Option<Pose>> = peer
+        .iter()
+        .map(|answer| (answer.frame, answer.pose))
+        .collect();
     let part = |keep: &dyn Fn(&View) -> bool| {
         let kept: Vec<&View> = views.iter().filter(|view| keep(view)).collect();
-        (!kept.is_empty()).then(|| part_of(&kept))
+        (!kept.is_empty()).then(|| part_of(&kept, &answers))
     };
     let seconds: Vec<f64> = views.iter().map(|view| view.seconds).collect();
     let whole: Vec<&View> = views.iter().collect();
     Ok(MatchedLocalization {
         mapped: mapped.len(),
-        all: part_of(&whole),
+        all: part_of(&whole, &answers),
         near: part(&|view| view.is_near),
         far: part(&|view| !view.is_near),
         match_ms: 1e3 * seese3_core::statistics::median(&seconds),
@@ -176,9 +239,10 @@ fn located(
     recording: TrialRecording<'_>,
     room: &KeypointRoom,
     baselines: &Baselines<'_>,
-    row: usize,
+    frame: FrameId,
     clock: &(dyn Fn() -> f64 + Sync),
 ) -> View {
+    let row = frame.row();
     let truth = recording.poses[row];
     let begun = clock();
     let located = room.locate(ViewKeypoints {
@@ -206,6 +270,7 @@ fn located(
 
     let (nearest, blend) = baselines.poses_of(row);
     View {
+        frame,
         truth,
         located,
         nearest,
@@ -276,45 +341,111 @@ impl<'a> Baselines<'a> {
     }
 }
 
-fn part_of(views: &[&View]) -> MatchedPart {
+fn part_of(views: &[&View], peer: &BTreeMap<FrameId, Option<Pose>>) -> MatchedPart {
     let errors_of = |pose: &dyn Fn(&View) -> Pose| {
-        let errors: Vec<PoseError> = views
-            .iter()
-            .map(|view| PoseError::between(&view.truth, &pose(view)))
-            .collect();
+        let errors: Vec<PoseError> = views.iter().map(|view| view.error(&pose(view))).collect();
         LocalizationErrors::of(&errors)
     };
 
-    let answers: Vec<(PoseError, f64)> = views
-        .iter()
-        .filter_map(|view| {
-            let located = view.located.as_ref().ok()?;
-            let error = PoseError::between(&view.truth, &located.pose);
-            Some((error, located.squared_length))
-        })
-        .collect();
-    let errors: Vec<PoseError> = answers.iter().map(|(error, _)| *error).collect();
-    let lengths: Vec<f64> = errors.iter().map(|error| error.translation_m).collect();
-    let squared_lengths: Vec<f64> = answers.iter().map(|(_, squared)| *squared).collect();
-    let wrong = errors
-        .iter()
-        .filter(|error| error.translation_m > WRONG_M || error.rotation_rad > WRONG_RAD)
-        .count();
-
     MatchedPart {
         n: views.len(),
-        ours: Answered {
-            answered: answers.len() as f64 / views.len() as f64,
-            errors: LocalizationErrors::of(&errors),
-            rmse_m: root_mean_square(&lengths),
-            wrong: wrong as f64 / answers.len().max(1) as f64,
-            coverage: coverage(&squared_lengths),
-        },
+        ours: ours(views),
         ours_or_nearest: errors_of(&|view| match &view.located {
             Ok(located) => located.pose,
             Err(_) => view.nearest,
         }),
         nearest_frame: errors_of(&|view| view.nearest),
         blend: errors_of(&|view| view.blend),
+        peer: comparison(views, peer),
+    }
+}
+
+/// The answers of matched views.
+fn ours(views: &[&View]) -> Answered {
+    let located = || views.iter().filter_map(|view| view.located.as_ref().ok());
+    let squared_lengths: Vec<f64> = located().map(|located| located.squared_length).collect();
+    let errors: Vec<PoseError> = views.iter().filter_map(|view| view.our_error()).collect();
+    Answered {
+        coverage: Some(coverage(&squared_lengths)),
+        ..Answered::of(&errors, views.len())
+    }
+}
+
+/// Matched views and the peer, on the views that the peer was asked for.
+fn comparison(views: &[&View], peer: &BTreeMap<FrameId, Option<Pose>>) -> Option<PeerComparison> {
+    let mut asked = Vec::new();
+    let mut errors = Vec::new();
+    let mut both = Vec::new();
+    for view in views {
+        let Some(answer) = peer.get(&view.frame) else {
+            continue;
+        };
+        asked.push(*view);
+
+        let error = answer.map(|pose| view.error(&pose));
+        errors.extend(error);
+        both.extend(view.our_error().zip(error));
+    }
+
+    (!asked.is_empty()).then(|| PeerComparison {
+        n: asked.len(),
+        peer: Answered::of(&errors, asked.len()),
+        ours: ours(&asked),
+        both: PairedErrors::of(&both),
+    })
+}
+
+impl View {
+    fn error(&self, pose: &Pose) -> PoseError {
+        PoseError::between(&self.truth, pose)
+    }
+
+    /// The error of matched views, if they answer.
+    fn our_error(&self) -> Option<PoseError> {
+        let located = self.located.as_ref().ok()?;
+        Some(self.error(&located.pose))
+    }
+}
+
+impl Answered {
+    /// Scores of the answers to `asked` views, in recording order, without a coverage.
+    fn of(errors: &[PoseError], asked: usize) -> Self {
+        let lengths: Vec<f64> = errors.iter().map(|error| error.translation_m).collect();
+        let wrong = errors
+            .iter()
+            .filter(|error| error.translation_m > WRONG_M || error.rotation_rad > WRONG_RAD)
+            .count();
+
+        Self {
+            answered: errors.len() as f64 / asked as f64,
+            errors: LocalizationErrors::of(errors),
+            rmse_m: root_mean_square(&lengths),
+            wrong: wrong as f64 / errors.len().max(1) as f64,
+            coverage: None,
+        }
+    }
+}
+
+impl PairedErrors {
+    /// Compares our errors with the peer's, in recording order; `None` without any.
+    fn of(pairs: &[(PoseError, PoseError)]) -> Option<Self> {
+        if pairs.is_empty() {
+            return None;
+        }
+
+        let (ours, peer): (Vec<PoseError>, Vec<PoseError>) = pairs.iter().copied().unzip();
+        let differences: Vec<f64> = pairs
+            .iter()
+            .map(|(ours, peer)| ours.translation_m - peer.translation_m)
+            .collect();
+        let nearer = differences.iter().filter(|&&meters| meters < 0.0).count();
+
+        Some(Self {
+            n: pairs.len(),
+            ours: LocalizationErrors::of(&ours),
+            peer: LocalizationErrors::of(&peer),
+            difference_m: median_of_recording(&differences, 0),
+            ours_nearer: nearer as f64 / pairs.len() as f64,
+        })
     }
 }

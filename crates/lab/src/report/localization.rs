@@ -7,7 +7,9 @@ use seese3_core::statistics::RecordedMedian;
 
 use super::table::Table;
 use crate::experiments::localization::{Localization, LocalizationErrors};
-use crate::experiments::matched_localization::MatchedLocalization;
+use crate::experiments::matched_localization::{
+    Answered, MatchedLocalization, MatchedPart, PairedErrors, PeerComparison,
+};
 use crate::experiments::motion::{MotionEvaluation, TwoViewErrors};
 
 /// One line per localization method: medians with intervals, and 90 % quantiles of the errors.
@@ -33,18 +35,13 @@ pub fn matched_localization_table(found: &MatchedLocalization) -> String {
     let mut table = Table::new(
         "views | located by | answered | median m | 90 % m | median ° | 90 % ° | wrong | 68 % | 95 %",
     );
-    let parts = [
-        ("all", Some(&found.all)),
-        ("near the map", found.near.as_ref()),
-        ("far from the map", found.far.as_ref()),
-    ];
-
-    for (name, part) in parts {
-        let Some(part) = part else { continue };
+    for (name, part) in parts(found) {
         let ours = &part.ours;
         let shares = [ours.answered, ours.wrong];
         let [answered, wrong] = shares.map(|share| format!("{share:.3}"));
-        let cover = [ours.coverage.within_68, ours.coverage.within_95];
+        let cover = ours.coverage.map_or([f64::NAN; 2], |coverage| {
+            [coverage.within_68, coverage.within_95]
+        });
         let [c68, c95] = cover.map(|share| format!("{share:.2}"));
 
         let label = format!("{name} ({})", part.n);
@@ -72,11 +69,92 @@ pub fn matched_localization_table(found: &MatchedLocalization) -> String {
         row("blend of three", &part.blend, ["1.000", "", "", ""]);
     }
 
+    let peer = peer_table(found);
     format!(
-        "{table}\nwrong: answers over 0.2 m or 10 degrees off; near the map: a mapped view within 0.25 m and 15 degrees; \
+        "{table}\n{peer}wrong: answers over 0.2 m or 10 degrees off; near the map: a mapped view within 0.25 m and 15 degrees; \
          RMSE of the answers {:.4} m; {:.1} ms to match a view",
         found.all.ours.rmse_m, found.match_ms
     )
+}
+
+/// The parts of the views that are not empty, with their names.
+fn parts(found: &MatchedLocalization) -> impl Iterator<Item = (&'static str, &MatchedPart)> {
+    let parts = [
+        ("all", Some(&found.all)),
+        ("near the map", found.near.as_ref()),
+        ("far from the map", found.far.as_ref()),
+    ];
+    parts
+        .into_iter()
+        .filter_map(|(name, part)| Some((name, part?)))
+}
+
+/// Matched views and the peer on the views that the peer was asked for; empty without a peer.
+fn peer_table(found: &MatchedLocalization) -> String {
+    let Some(all) = &found.all.peer else {
+        return String::new();
+    };
+
+    let mut table = Table::new(
+        "views of the peer | located by | answered | median m | 90 % m | median ° | 90 % ° | wrong",
+    );
+    for (name, part) in parts(found) {
+        let Some(PeerComparison {
+            n,
+            peer,
+            ours,
+            both,
+        }) = &part.peer
+        else {
+            continue;
+        };
+
+        let label = format!("{name} ({n})");
+        for (method, answers) in [("matched views", ours), ("peer", peer)] {
+            let Answered {
+                answered,
+                errors,
+                wrong,
+                ..
+            } = answers;
+            let shares = [answered, wrong].map(|share| format!("{share:.3}"));
+            table.row(&label, peer_cells(method, errors, shares));
+        }
+        if let Some(both) = both {
+            let label = format!("{name}, both answer ({})", both.n);
+            for (method, errors) in [("matched views", &both.ours), ("peer", &both.peer)] {
+                table.row(&label, peer_cells(method, errors, Default::default()));
+            }
+        }
+    }
+
+    let paired = all.both.as_ref().map(|both| {
+        let PairedErrors {
+            n,
+            difference_m,
+            ours_nearer,
+            ..
+        } = both;
+        format!(
+            "error of matched views minus error of the peer, {n} views: median {} m; matched views are nearer in {:.0} %\n",
+            interval(difference_m, 4),
+            100.0 * ours_nearer
+        )
+    });
+    format!("\n{table}\n{}", paired.unwrap_or_default())
+}
+
+fn peer_cells(method: &str, errors: &LocalizationErrors, shares: [String; 2]) -> [String; 7] {
+    let [answered, wrong] = shares;
+    [
+        method.to_owned(),
+        answered,
+        interval(&errors.translation_m.median, 4),
+        format!("{:.4}", errors.translation_m.p90),
+        interval(&errors.rotation_deg.median, 2),
+        format!("{:.2}", errors.rotation_deg.p90),
+        wrong,
+    ]
 }
 
 /// One line per motion estimator: medians with intervals, and 90 % quantiles of the errors. The

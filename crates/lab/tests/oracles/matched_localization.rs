@@ -6,8 +6,9 @@ use seese3_core::geometry::Pose;
 use seese3_core::keypoints::Keypoints;
 use seese3_core::room::FrameId;
 use seese3_lab::experiments::Error;
+use seese3_lab::experiments::localization::LocalizationErrors;
 use seese3_lab::experiments::matched_localization::{
-    MappedAndAsked, MatchedLocalization, evaluate,
+    MappedAndAsked, MatchedLocalization, PeerAnswer, evaluate,
 };
 use seese3_robot::matched_views::TrialRecording;
 use seese3_testing::keypoint_scene::{Random, Scene, camera_path, distorted_camera};
@@ -44,6 +45,15 @@ fn recording() -> (Vec<Pose>, Vec<Keypoints>) {
 }
 
 fn evaluated(mapped: &[FrameId], asked: &[FrameId]) -> Result<MatchedLocalization, Error> {
+    evaluated_beside(mapped, asked, &[])
+}
+
+/// The evaluation beside a peer.
+fn evaluated_beside(
+    mapped: &[FrameId],
+    asked: &[FrameId],
+    peer: &[PeerAnswer],
+) -> Result<MatchedLocalization, Error> {
     let (poses, keypoints) = recording();
     let features = Array2::from_shape_fn((poses.len(), 3), |(row, axis)| {
         1.0 + poses[row].translation.vector[axis] as f32
@@ -53,7 +63,11 @@ fn evaluated(mapped: &[FrameId], asked: &[FrameId]) -> Result<MatchedLocalizatio
         keypoints: &keypoints,
         camera: distorted_camera(),
     };
-    let frames = MappedAndAsked { mapped, asked };
+    let frames = MappedAndAsked {
+        mapped,
+        asked,
+        peer,
+    };
     evaluate(recording, features.view(), frames, &|| 0.0, &|| ())
 }
 
@@ -76,7 +90,7 @@ fn the_shares_of_answered_and_of_wrong_views_are_counted() {
     near("rmse", scores.all.ours.rmse_m, 0.125_f64.sqrt(), 1e-2);
     near(
         "within 95 %",
-        scores.all.ours.coverage.within_95,
+        scores.all.ours.coverage.unwrap().within_95,
         0.75,
         1e-12,
     );
@@ -104,7 +118,7 @@ fn exact_views_are_all_answered_right() {
     assert!(scores.all.ours.rmse_m < 1e-3, "{}", scores.all.ours.rmse_m);
     near(
         "within 95 %",
-        scores.all.ours.coverage.within_95,
+        scores.all.ours.coverage.unwrap().within_95,
         1.0,
         1e-12,
     );
@@ -114,6 +128,57 @@ fn exact_views_are_all_answered_right() {
         0.0,
         1e-12,
     );
+}
+
+/// Oracle: by hand. The peer is asked for six views and answers five, one of them 0.3 m off, which is
+/// wrong. We answer five of the six as well: not view 6, and view 8 1 m off. On the four views that
+/// both answer, our errors are 0, 0, 0 and 1 m, and the peer's 0.1, 0.05, 0.3 and 0 m.
+#[test]
+fn a_peer_is_compared_on_the_views_that_it_is_asked_for() {
+    let (poses, _) = recording();
+    let off = [
+        (0, Some(0.1)),
+        (1, Some(0.05)),
+        (2, Some(0.3)),
+        (3, None),
+        (6, Some(0.0)),
+        (8, Some(0.0)),
+    ];
+    let answers = off.map(|(view, off)| PeerAnswer {
+        frame: FrameId((MAPPED + view) as u32),
+        pose: off.map(|meters: f64| {
+            let mut pose = poses[MAPPED + view];
+            pose.translation.vector.y += meters;
+            pose
+        }),
+    });
+    let [mapped, asked] = [frames(0..MAPPED), frames(MAPPED..MAPPED + 10)];
+    let scores = evaluated_beside(&mapped, &asked, &answers).unwrap();
+
+    let found = scores.all.peer.unwrap();
+    assert_eq!(found.n, 6);
+    for (who, answers) in [("the peer", &found.peer), ("we", &found.ours)] {
+        near(who, answers.answered, 5.0 / 6.0, 1e-12);
+        near(who, answers.wrong, 0.2, 1e-12);
+    }
+    let median = |errors: LocalizationErrors| errors.translation_m.median.median;
+    near("the peer's median", median(found.peer.errors), 0.05, 1e-9);
+    assert!(found.peer.coverage.is_none() && found.ours.coverage.is_some());
+
+    let both = found.both.unwrap();
+    assert_eq!(both.n, 4);
+    near("the peer's median", median(both.peer), 0.075, 1e-9);
+    assert!(median(both.ours) < 1e-3);
+    near("difference", both.difference_m.median, -0.075, 1e-3);
+    near("ours nearer", both.ours_nearer, 0.75, 1e-12);
+
+    let parts = [scores.near, scores.far].map(|part| part.unwrap().peer.map_or(0, |peer| peer.n));
+    assert_eq!(parts.iter().sum::<usize>(), 6);
+    let alone = evaluated(&mapped, &asked).unwrap();
+    assert!(alone.all.peer.is_none(), "no peer, no comparison");
+
+    let error = evaluated_beside(&mapped, &frames(MAPPED..MAPPED + 8), &answers).unwrap_err();
+    assert!(error.to_string().contains("frame 32"), "{error}");
 }
 
 /// Oracle: the definition of the input.
