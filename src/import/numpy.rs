@@ -11,7 +11,8 @@ use seese3_data::datasets;
 
 #[derive(Debug, Args)]
 pub struct Numpy {
-    /// A folder with poses.npy and, optionally, timestamps.npy, frame_ids.npy and features_NAME.npy
+    /// A folder with poses.npy and, optionally, timestamps.npy, frame_ids.npy, sequences.npy and
+    /// features_NAME.npy
     #[arg(required_unless_present = "poses", conflicts_with = "timestamps")]
     path: Option<PathBuf>,
     /// Either the transform that the poses represent, world_from_camera or camera_from_world, or,

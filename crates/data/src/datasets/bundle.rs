@@ -3,6 +3,7 @@
 //!
 //! ```text
 //! poses.npy (n, 4, 4)   timestamps.npy (n,) ns   frame_ids.npy (n,)   features_NAME.npy (n, d)
+//! sequences.npy (n,)    the recording that each frame is from, if there are several; not exported
 //! bundle.json           the metadata: name, license, images, sequences, split and the sources of
 //!                       the features
 //! ```
@@ -10,6 +11,7 @@
 //! `import numpy` reads the arrays only; `import bundle` also reads `bundle.json`, which restores
 //! an exported room completely.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use ndarray::{Array1, Array3, ArrayBase, Data, Dimension};
@@ -59,8 +61,9 @@ struct Bundle {
 /// Reads a folder of NumPy files, of which only `poses.npy` is required.
 ///
 /// # Errors
-/// [`Error`] if a file cannot be read or has another shape or type, or if the number of timestamps
-/// or frame numbers differs from the number of poses. The message names the file.
+/// [`Error`] if a file cannot be read or has another shape or type, if the number of timestamps,
+/// frame numbers or sequence numbers differs from the number of poses, or if the frames of a
+/// sequence are not in one block. The message names the file.
 pub fn read_numpy(folder: &Path) -> Result<Recording, Error> {
     let mut recording = read_poses(&folder.join("poses.npy"))?;
     let there = |name: &str| Some(folder.join(name)).filter(|file| file.is_file());
@@ -69,6 +72,9 @@ pub fn read_numpy(folder: &Path) -> Result<Recording, Error> {
     }
     if let Some(file) = there("frame_ids.npy") {
         recording.frames.numbers = read_numbers(&file)?;
+    }
+    if let Some(file) = there("sequences.npy") {
+        recording.frames.sequences = read_sequences(&file)?;
     }
 
     check_lengths(&folder.join("poses.npy"), &recording)?;
@@ -90,6 +96,36 @@ pub fn read_numpy(folder: &Path) -> Result<Recording, Error> {
     }
 
     Ok(recording)
+}
+
+/// The sequence numbers of the frames. Frames of one sequence are consecutive, because motions are
+/// read between consecutive rows.
+fn read_sequences(file: &Path) -> Result<Vec<u32>, Error> {
+    let malformed = |problem: String| Error::Malformed {
+        file: file.to_owned(),
+        problem: problem.into(),
+    };
+
+    let mut sequences: Vec<u32> = Vec::new();
+    let mut ended = BTreeSet::new();
+    for (row, number) in read_numbers(file)?.into_iter().enumerate() {
+        let sequence = u32::try_from(number).map_err(|_| {
+            malformed(format!(
+                "row {row} is {number}; sequences are numbered from 0"
+            ))
+        })?;
+        if let Some(&before) = sequences.last().filter(|&&before| before != sequence) {
+            ended.insert(before);
+        }
+        if ended.contains(&sequence) {
+            return Err(malformed(format!(
+                "sequence {sequence} goes on in row {row}, after another one; the frames of a sequence \
+                 must be in one block"
+            )));
+        }
+        sequences.push(sequence);
+    }
+    Ok(sequences)
 }
 
 /// Reads a folder that [`write_numpy`] wrote.

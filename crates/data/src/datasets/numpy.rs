@@ -155,7 +155,7 @@ pub(super) fn read_numbers(file: &Path) -> Result<Vec<i64>, Error> {
     if array.ndim() != 1 {
         return Err(malformed(
             file,
-            &format!("has shape {:?}, frame ids are (n,)", array.shape()),
+            &format!("has shape {:?}; must be (n,)", array.shape()),
         ));
     }
 

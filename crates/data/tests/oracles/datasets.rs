@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera};
-use seese3_core::room::{Provenance, Room, RoomId};
+use seese3_core::room::{FrameId, Provenance, Room, RoomId};
+use seese3_core::splits::HoldOut;
 use seese3_data::datasets::{
     Error, Reader, Recording, SevenScenes, Unusable, read_arkitscenes, read_bundle, read_numpy,
     read_scannet, read_sens, read_seven_scenes, read_tum, read_twelve_scenes, write_numpy,
@@ -164,6 +165,16 @@ fn seven_scenes_keeps_sequences_and_the_split() {
 
     assert_eq!(found.frames.sequences, [0, 0, 0, 0, 0, 0, 1, 1]);
     assert_eq!(found.frames.numbers, [0, 1, 2, 3, 4, 5, 0, 1]);
+
+    // Both sequences are one room: the first can be mapped, and the second localized in it.
+    let name = RoomId::new("chess").unwrap();
+    let room = Room::new(name, found.frames.clone(), Provenance::default()).unwrap();
+    let rows = |frames: Vec<FrameId>| frames.iter().map(|frame| frame.0).collect::<Vec<_>>();
+    assert_eq!(
+        rows(HoldOut::Visit.mapped(room.timeline())),
+        [0, 1, 2, 3, 4, 5]
+    );
+    assert_eq!(rows(HoldOut::Visit.tracked(room.timeline())), [6, 7]);
 
     let one = SevenScenes {
         sequence: Some("seq-02".to_owned()),
@@ -462,6 +473,38 @@ fn an_exported_room_comes_back_whole() {
         write_numpy(out.path(), &room, &[]).is_err(),
         "the folder is not empty"
     );
+}
+
+/// Oracle: by hand. Three recordings of one room, in one world frame: 2, 1 and 2 frames.
+#[test]
+fn arrays_of_several_recordings_make_one_room() {
+    let folder = tempfile::tempdir().unwrap();
+    let poses = ndarray::Array3::from_shape_fn((5, 4, 4), |(_, row, column)| {
+        f64::from(u8::from(row == column))
+    });
+    ndarray_npy::write_npy(folder.path().join("poses.npy"), &poses).unwrap();
+    let read = |sequences: &[i64]| {
+        let file = folder.path().join("sequences.npy");
+        ndarray_npy::write_npy(file, &ndarray::Array1::from(sequences.to_vec())).unwrap();
+        read_numpy(folder.path())
+    };
+
+    let frames = read(&[4, 4, 0, 1, 1]).unwrap().frames;
+    assert_eq!(frames.sequences, [4, 4, 0, 1, 1]);
+    let room = Room::new(RoomId::new("r").unwrap(), frames, Provenance::default()).unwrap();
+    let joined: Vec<bool> = (0..4)
+        .map(|row| room.timeline().joins(FrameId(row), FrameId(row + 1)))
+        .collect();
+    assert_eq!(joined, [true, false, false, true]);
+
+    for (sequences, words) in [
+        (&[0, 0, 1, 1, 0][..], "sequence 0 goes on in row 4"),
+        (&[0, 0, 0, 0, -1], "row 4 is -1"),
+        (&[0, 0, 0, 0], "5 poses but 4 sequence marks"),
+    ] {
+        let error = read(sequences).unwrap_err().to_string();
+        assert!(error.contains(words), "{error}");
+    }
 }
 
 /// Oracle: a bundle that lost or gained a part is not the room that was written.
