@@ -12,6 +12,8 @@ mod basics;
 mod disks;
 mod kills;
 mod manners;
+#[cfg(feature = "onnx")]
+mod matched_views;
 mod program;
 mod research;
 mod rooms;

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use nalgebra::Translation3;
 use seese3_core::adapter::Adapter;
 use seese3_core::features::Features;
 use seese3_core::geometry::{Pose, PoseError, body_twist, exp};
@@ -9,8 +10,8 @@ use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::room::{FrameId, Frames, Room, RoomId};
 use seese3_core::statistics::root_mean_square;
 use seese3_robot::tracking::{
-    Drift, Map, MapQuery, MeasuredPose, Observation, PoseReader, PoseWithCovariance, State, Status,
-    Tracker, TrackerSettings, Update,
+    Drift, Map, MapQuery, MatchedPose, MeasuredPose, Observation, PoseReader, PoseWithCovariance,
+    State, Status, Tracker, TrackerSettings, Update,
 };
 use seese3_testing::world::{FRAMES, calibrated, place, served};
 
@@ -296,6 +297,64 @@ fn the_reader_of_a_room_gives_the_anchors() {
     let (row, without) = run(false);
     let error = PoseError::between(&without.pose, &truth[row]);
     assert!(error.translation_m > 0.8, "{error:?}");
+}
+
+/// Oracle: the true poses, which the matched keypoints give. They prove the place although the latents
+/// are those of no place; two that agree start the tracking; another place is only believed once two
+/// agree on it.
+#[test]
+fn matched_keypoints_prove_the_place_whatever_the_latents_say() {
+    let adapter = Arc::new(calibrated().0);
+    let (room, features) = served("hall");
+    let tracker = tracker(&adapter, room.poses().to_vec(), &features);
+    let truth = room.poses();
+
+    let observed = |state: &mut State, row: usize, pose: Pose| {
+        let latent = adapter
+            .embed_one(&features.rows().row(row).to_vec())
+            .unwrap()
+            + 50.0;
+        let observation = Observation {
+            matched: Some(MatchedPose {
+                room: 0,
+                pose: PoseWithCovariance::known(pose, 0.01, 0.01),
+                novelty: 0.5,
+            }),
+            ..Observation::new(row as i64 * 33_000_000, row as u64, latent)
+        };
+        tracker.observe(state, &observation).unwrap()
+    };
+    let distance = |update: &Update, pose: &Pose| {
+        PoseError::between(&update.map_pose.unwrap().pose, pose).translation_m
+    };
+
+    let mut state = tracker.start(None);
+    assert_eq!(
+        observed(&mut state, 41, truth[41]).status,
+        Status::Relocalizing
+    );
+    for row in (43..101).step_by(2) {
+        let update = observed(&mut state, row, truth[row]);
+        assert_eq!(
+            update.status,
+            Status::Tracking,
+            "row {row}: {}",
+            update.reason
+        );
+        assert!(
+            update.match_used && update.out_of_distribution == 0.5,
+            "row {row}"
+        );
+        assert!(distance(&update, &truth[row]) < 0.03, "row {row}");
+    }
+
+    let moved = |row: usize| Translation3::new(3.0, 0.0, 0.0) * truth[row];
+    let first = observed(&mut state, 101, moved(101));
+    assert_eq!(first.status, Status::Degraded, "{}", first.reason);
+    assert!(distance(&first, &truth[101]) < 0.1);
+    let second = observed(&mut state, 103, moved(103));
+    assert_eq!(second.status, Status::Tracking, "{}", second.reason);
+    assert!(distance(&second, &moved(103)) < 0.1);
 }
 
 /// Oracle: the true poses of frames that are not mapped: the blend of the frames most like a view

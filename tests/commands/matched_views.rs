@@ -1,0 +1,155 @@
+//! A real room with keypoints is mapped, served, and asked for views that are not mapped.
+
+use std::fs;
+use std::path::Path;
+
+use seese3_core::geometry::{Pose, PoseError};
+use seese3_testing::{number, shared};
+use serde_json::Value;
+
+use crate::program::Place;
+
+/// Frames of the recording that are mapped, and one between two of them.
+const MAPPED: std::ops::Range<usize> = 0..400;
+const EVERY: usize = 10;
+const ASKED: usize = 105;
+
+fn kitchen_file(frame: usize, kind: &str) -> String {
+    format!("seq-01/frame-{frame:06}.{kind}")
+}
+
+/// A place with a part of the kitchen, mapped with keypoints, and the view of a frame between.
+fn mapped() -> Place {
+    let here = Place::new();
+    let kitchen = shared().join("rooms/kitchen");
+    fs::create_dir_all(here.file("kitchen/seq-01")).unwrap();
+    for frame in MAPPED.step_by(EVERY) {
+        for kind in ["color.jpg", "pose.txt"] {
+            let file = kitchen_file(frame, kind);
+            fs::copy(kitchen.join(&file), here.file(&format!("kitchen/{file}"))).unwrap();
+        }
+    }
+    fs::copy(
+        kitchen.join(kitchen_file(ASKED, "color.jpg")),
+        here.file("view.jpg"),
+    )
+    .unwrap();
+
+    here.succeeds("import 7scenes kitchen --name kitchen --camera 640x480,525 --store store");
+    let model = shared().join("models/xfeat_keypoints_320x240.onnx");
+    fs::copy(model, here.file("model.onnx")).unwrap();
+    here.succeeds(
+        "encode --store store --room kitchen --model model.onnx --recipe xfeat-keypoints",
+    );
+    here
+}
+
+fn true_pose(file: &Path) -> Pose {
+    let text = fs::read_to_string(file).unwrap();
+    let numbers: Vec<f64> = text
+        .split_whitespace()
+        .map(|x| x.parse().unwrap())
+        .collect();
+    let rows: [f64; 16] = numbers.try_into().unwrap();
+    seese3_testing::pose(&rows)
+}
+
+fn pose_of(answer: &Value) -> Pose {
+    let pose = &answer["pose"]["pose"];
+    let of = |group: &str, key: &str| number(&pose[group][key]);
+    let rotation = nalgebra::Quaternion::new(
+        of("orientation", "w"),
+        of("orientation", "x"),
+        of("orientation", "y"),
+        of("orientation", "z"),
+    );
+    let [x, y, z] = ["x", "y", "z"].map(|axis| of("position", axis));
+    Pose::from_parts(
+        nalgebra::Translation3::new(x, y, z),
+        nalgebra::UnitQuaternion::from_quaternion(rotation),
+    )
+}
+
+/// Oracle: the recorded pose of the frame; the true focal length, 525 pixels; a view of a drawn room,
+/// which is not in the kitchen.
+#[test]
+#[ignore = "needs the folder of large inputs: SEESE3_SHARED or ../shared"]
+fn a_view_is_located_by_its_keypoints_without_an_adapter() {
+    let here = mapped();
+    here.succeeds(
+        "studio --rooms 1 --frames 12 --seed 3 --out drawn --encode builtin --keep-images",
+    );
+    let other = walk(&here.file("drawn"));
+    let other = other
+        .iter()
+        .find(|file| file.ends_with("5.png") || file.ends_with("5.jpg"));
+    let other = other.expect("the studio kept no image 5");
+
+    let server = here.serve("--encoder model.onnx");
+    let to = format!("--server {}", server.address);
+    let ask = format!("localize {to} --room kitchen --image view.jpg");
+
+    let printed = here.succeeds(&format!("{ask} --camera 640x480,525 --json found.json"));
+    assert!(printed.contains("matched keypoints"), "{printed}");
+    let found = here.json("found.json");
+    let truth = shared()
+        .join("rooms/kitchen")
+        .join(kitchen_file(ASKED, "pose.txt"));
+    let error = PoseError::between(&pose_of(&found), &true_pose(&truth));
+    assert!(
+        error.translation_m < 0.03 && error.rotation_rad < 0.015,
+        "{error:?}"
+    );
+    assert_eq!(found["method"], "LOCALIZATION_METHOD_MATCHED_KEYPOINTS");
+    assert_eq!(found["room"]["name"], "kitchen");
+    assert!(number(&found["novelty"]) < 1.0);
+    assert!(found.get("adapter").is_none_or(Value::is_null), "{found}");
+
+    // The mapping camera is the same one.
+    here.succeeds(&format!("{ask} --camera mapping --json same.json"));
+    let apart = PoseError::between(&pose_of(&found), &pose_of(&here.json("same.json")));
+    assert!(apart.translation_m < 1e-9, "{apart:?}");
+
+    here.refuses(&ask, &["camera: is required", "mapping_camera"]);
+    let contradicted = format!("{ask} --camera 640x480,400");
+    here.refuses(
+        &contradicted,
+        &["camera: the matches contradict the focal length", "0.625"],
+    );
+    let cropped = format!("{ask} --camera 640x360,525");
+    here.refuses(&cropped, &["view.image: has 640 × 480 pixels"]);
+
+    let views = format!("relocalize {to} --camera mapping --json placed.json --images");
+    here.prints(
+        &format!("{views} view.jpg"),
+        &["unambiguous", "matched keypoints"],
+    );
+    let placed = here.json("placed.json");
+    assert_eq!(placed["rooms"][0]["room"]["name"], "kitchen");
+
+    let strange = format!("localize {to} --room kitchen --camera mapping --image {other}");
+    here.prints(
+        &format!("{strange} --json strange.json"),
+        &["not in the map"],
+    );
+    let strange = here.json("strange.json");
+    assert!(strange.get("pose").is_none_or(Value::is_null), "{strange}");
+    assert!(number(&strange["novelty"]) > 1.0);
+    here.prints(
+        &format!("{views} {other}"),
+        &["ambiguous", "too few keypoints"],
+    );
+}
+
+fn walk(folder: &Path) -> Vec<String> {
+    let mut files = Vec::new();
+    for entry in fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            files.extend(walk(&path));
+        } else {
+            files.push(path.display().to_string());
+        }
+    }
+    files
+}
