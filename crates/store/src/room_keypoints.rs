@@ -151,18 +151,18 @@ impl KeypointsEntry {
     /// Checks that the numbers are those of a map.
     fn check(&self) -> Result<(), String> {
         let MapNoise {
-            translation_m,
-            rotation_rad,
             design_effect,
             gap_scale,
+            pose_noise,
+            pose_drift,
         } = self.noise;
         let numbers = [
             self.unit_m,
             self.epipolar_px,
-            translation_m,
-            rotation_rad,
             design_effect,
             gap_scale,
+            pose_noise,
+            pose_drift,
         ];
 
         let is_positive = |value: &f64| value.is_finite() && *value > 0.0;
@@ -325,7 +325,7 @@ mod tests {
             },
             "unit_m": 2.0, "epipolar_px": 0.5,
             "noise": {
-                "translation_m": 0.1, "rotation_rad": 0.1, "design_effect": 2.0, "gap_scale": 0.1,
+                "design_effect": 2.0, "gap_scale": 0.1, "pose_noise": 0.1, "pose_drift": 0.1,
             },
             "object": { "file": "keypoints-0.safetensors", "sha256": "", "bytes": 0 },
         }))
@@ -405,8 +405,8 @@ mod tests {
             for change in [
                 (|entry, bad| entry.unit_m = bad) as fn(&mut KeypointsEntry, f64),
                 |entry, bad| entry.epipolar_px = bad,
-                |entry, bad| entry.noise.translation_m = bad,
-                |entry, bad| entry.noise.rotation_rad = bad,
+                |entry, bad| entry.noise.pose_noise = bad,
+                |entry, bad| entry.noise.pose_drift = bad,
                 |entry, bad| entry.noise.design_effect = bad,
                 |entry, bad| entry.noise.gap_scale = bad,
             ] {

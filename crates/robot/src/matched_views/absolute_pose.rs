@@ -10,6 +10,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::p3p::p3p;
 use seese3_core::geometry::{Pose, Twist, exp};
+use seese3_core::statistics::mean;
 
 /// Sample size of P3P.
 const SAMPLE: usize = 3;
@@ -29,6 +30,8 @@ const MAX_FOCAL_STEP: f64 = 0.1;
 /// Largest logarithm of a fitted focal length over the stated one. Beyond it, the fit has shrunk the
 /// view to a point.
 const MAX_LOG_FOCAL: f64 = 0.6;
+/// Least variance of a keypoint's position, squared pixels: that of stored positions is not 0.
+const LEAST_VARIANCE_PX: f64 = 0.01;
 /// Minimum depth of a map point in front of the camera, meters.
 const MIN_DEPTH: f64 = 1e-6;
 
@@ -51,34 +54,36 @@ pub(super) struct Correspondence {
 
 /// Noise of a map, from which the covariance of a view's pose follows:
 ///
-/// covariance = H⁻¹ · `design_effect` · (1 + gap / `gap_scale`) + stated noise
+/// covariance = H⁻¹ · `design_effect` · (1 + gap / `gap_scale`)
+///            + (`pose_noise`² + `pose_drift`² · gap) · I
 ///
-/// H is the information of the matches if their errors were independent. They are not: nearby
-/// points share errors of their depths, and the stated poses of the map drift. The shared part grows
-/// with the gap, the distance of the view from the matched frames.
+/// H is the information of the matches, at the variance of their reprojection errors, if the errors
+/// were independent. They are not: nearby points share errors of their depths, which displace a view
+/// the more the farther it is from the matched frames. The errors of the map's stated poses have an
+/// independent part, and a part that drifts like a random walk, with a variance in proportion to the
+/// gap. I is the identity in units (median depths) and radians.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct MapNoise {
-    /// Standard deviation of a stated position along each axis, meters.
-    pub translation_m: f64,
-    /// Standard deviation of a stated rotation about each axis, radians.
-    pub rotation_rad: f64,
     /// Factor on the variance of independent matches, at a gap of 0.
     pub design_effect: f64,
-    /// The gap that doubles that variance, in units (median depths) plus radians.
+    /// The gap that doubles that variance.
     pub gap_scale: f64,
+    /// Standard deviation of the independent errors of stated poses: units (median depths) along
+    /// each axis, and radians about it.
+    pub pose_noise: f64,
+    /// Standard deviation of the drift of stated poses over a gap of 1, likewise.
+    pub pose_drift: f64,
 }
 
 impl MapNoise {
-    /// Noise of a map in which it was not measured. `unit_m` is the median depth, meters.
-    pub fn typical(unit_m: f64) -> Self {
-        Self {
-            translation_m: 0.001 * unit_m,
-            rotation_rad: 0.001,
-            design_effect: 20.0,
-            gap_scale: 0.1,
-        }
-    }
+    /// Noise of a map in which it was not measured.
+    pub const TYPICAL: Self = Self {
+        design_effect: 5.0,
+        gap_scale: 0.05,
+        pose_noise: 0.001,
+        pose_drift: 0.005,
+    };
 }
 
 /// Settings of the search.
@@ -106,7 +111,7 @@ pub(super) struct Found {
     /// Indices of the inliers among the correspondences.
     pub inliers: Vec<usize>,
     /// Information matrix (inverse covariance) of δ in true = pose · exp(δ), ordered (v, ω), if
-    /// the errors of all matches were independent.
+    /// the errors of all matches were independent, at the variance of their reprojection errors.
     pub information: Matrix6<f64>,
     /// The focal length that fits the matches best, if there is one.
     pub focal: Option<FocalFit>,
@@ -282,9 +287,12 @@ impl Search {
             }
         }
 
-        let information = self.normal_equations(matches, &inliers, &pose).information;
+        // The variance of a keypoint's position is measured, not the one assumed above.
+        let assumed = self.normal_equations(matches, &inliers, &pose).information;
         let inliers = self.inliers(matches, &pose.inverse());
-        let focal = self.focal_fit(matches, &pose);
+        let variance_px = self.variance_px(matches, &inliers, &pose);
+        let information = assumed * (self.deviation_px.powi(2) / variance_px);
+        let focal = self.focal_fit(matches, &pose, variance_px);
         Some(Found {
             pose,
             inliers,
@@ -295,7 +303,12 @@ impl Search {
 
     /// Refines a pose together with the focal length, and counts the matches that then agree.
     /// `None` if the fit does not converge.
-    fn focal_fit(&self, matches: &[Correspondence], pose: &Pose) -> Option<FocalFit> {
+    fn focal_fit(
+        &self,
+        matches: &[Correspondence],
+        pose: &Pose,
+        variance_px: f64,
+    ) -> Option<FocalFit> {
         let mut pose = *pose;
         let mut log_factor = 0.0_f64;
         let mut variance = f64::INFINITY;
@@ -337,7 +350,7 @@ impl Search {
                 return None;
             }
             let unit = SVector::<f64, 7>::from_fn(|row, _| if row == 6 { 1.0 } else { 0.0 });
-            variance = cholesky.solve(&unit)[6] * self.deviation_px * self.deviation_px;
+            variance = cholesky.solve(&unit)[6] * variance_px;
             let by_pose: Vector6<f64> = step.fixed_rows::<6>(0).into();
             pose *= exp(&Twist::from_vector(&by_pose));
             log_factor += step[6];
@@ -356,6 +369,17 @@ impl Search {
             inliers: matches.iter().filter(agrees).count(),
             independent_variance: variance,
         })
+    }
+
+    /// Mean squared reprojection error of the inliers along one axis, squared pixels; at least
+    /// [`LEAST_VARIANCE_PX`].
+    fn variance_px(&self, matches: &[Correspondence], inliers: &[usize], pose: &Pose) -> f64 {
+        let camera_from_world = pose.inverse();
+        let squared: Vec<f64> = inliers
+            .iter()
+            .map(|&place| 0.5 * self.squared_error(&matches[place], &camera_from_world))
+            .collect();
+        mean(&squared).max(LEAST_VARIANCE_PX)
     }
 
     fn normal_equations(
@@ -448,10 +472,14 @@ impl NormalEquations {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PoseInformation {
     /// Information matrix (inverse covariance) of δ in true = pose · exp(δ), ordered (v, ω), if
-    /// the errors of all matches were independent.
+    /// the errors of all matches were independent, at the variance of their reprojection errors.
     pub independent: Matrix6<f64>,
-    /// Distance of the view from the nearest matched frame, in units (median depths) plus radians.
+    /// Distance of the view from the mean of the matched frames: the length of their mean
+    /// displacement, in units and radians. It is small for a view between the frames, where their
+    /// errors cancel.
     pub gap: f64,
+    /// The unit: the median depth of the map's keypoints, meters.
+    pub unit_m: f64,
 }
 
 impl PoseInformation {
@@ -464,10 +492,14 @@ impl PoseInformation {
     /// pose is stated with the same noise as the poses of the map; `None` if the matches do not
     /// determine the pose.
     pub fn covariance(&self, noise: &MapNoise) -> Option<Matrix6<f64>> {
-        let factor = self.factor(noise);
-        let [v, w] = [noise.translation_m, noise.rotation_rad].map(|deviation| deviation.powi(2));
-        let stated = Matrix6::from_diagonal(&Vector6::new(v, v, v, w, w, w));
-        let covariance = Cholesky::new(self.independent)?.inverse() * factor + stated;
+        let of_matches = self.factor(noise);
+        let rotation = noise.pose_noise.powi(2) + noise.pose_drift.powi(2) * self.gap;
+        let position = rotation * self.unit_m.powi(2);
+        let of_poses = Matrix6::from_diagonal(&Vector6::new(
+            position, position, position, rotation, rotation, rotation,
+        ));
+
+        let covariance = Cholesky::new(self.independent)?.inverse() * of_matches + of_poses;
         Some((covariance + covariance.transpose()) * 0.5)
     }
 }

@@ -194,7 +194,7 @@ impl<'a> Mapping<'a> {
             camera: self.camera,
             unit_m: self.unit_m,
             epipolar_px: self.epipolar_px,
-            noise: MapNoise::typical(self.unit_m),
+            noise: MapNoise::TYPICAL,
             basis: self.basis,
             frames,
         }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use nalgebra::Vector2;
+use nalgebra::{Vector2, Vector6};
 use ndarray::Array2;
 
 use super::absolute_pose::{Correspondence, FocalFit, PoseInformation, Search, find_pose};
@@ -11,7 +11,7 @@ use super::keypoint_map::KeypointMap;
 use super::parameters::MatchingParameters;
 use super::retrieval::PlaceIndex;
 use super::triangulation::{pixel_focal, plane_points};
-use seese3_core::geometry::{CameraIntrinsics, Pose};
+use seese3_core::geometry::{CameraIntrinsics, Pose, Twist, log};
 use seese3_core::keypoints::Keypoints;
 use seese3_core::statistics::{mean, root_mean_square};
 
@@ -56,6 +56,13 @@ pub struct MatchedView {
     pub focal: Option<FocalFit>,
     /// The inliers.
     pub matches: Vec<InlierMatch>,
+}
+
+impl MatchedView {
+    /// Whether the inliers are enough, and spread widely enough, for an accepted pose.
+    pub fn is_supported(&self, parameters: &MatchingParameters) -> bool {
+        self.inliers >= parameters.min_inliers && self.spread >= parameters.min_spread
+    }
 }
 
 /// An inlier of a matched view.
@@ -197,10 +204,13 @@ impl<'a> Query<'a> {
             })
             .collect();
 
-        let gap = frames
-            .iter()
-            .map(|&frame| self.map.gap(&poses[frame], &found.pose))
-            .fold(f64::INFINITY, f64::min);
+        let displacements = inliers().map(|match_| {
+            let Twist { linear, angular } = log(&found.pose.inv_mul(&poses[match_.frame]));
+            let linear = linear / self.map.unit_m;
+            Twist { linear, angular }.to_vector()
+        });
+        let count = found.inliers.len().max(1) as f64;
+        let gap = (displacements.sum::<Vector6<f64>>() / count).norm();
 
         Some(MatchedView {
             pose: found.pose,
@@ -211,6 +221,7 @@ impl<'a> Query<'a> {
             information: PoseInformation {
                 independent: found.information,
                 gap,
+                unit_m: self.map.unit_m,
             },
             focal: found.focal,
             matches,

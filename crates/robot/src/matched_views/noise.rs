@@ -17,10 +17,10 @@ const VIEWS: usize = 80;
 const MIN_TRIALS: usize = 30;
 /// Degrees of freedom of the Student's t distribution of the errors.
 const DEGREES_OF_FREEDOM: f64 = 5.0;
-/// The search multiplies or divides each deviation by this factor, which shrinks when no step helps.
+/// The search multiplies or divides each number by this factor, which shrinks when no step helps.
 const FIRST_FACTOR: f64 = 2.0;
 const LAST_FACTOR: f64 = 1.02;
-/// Range of the deviations, in those of [`MapNoise::typical`].
+/// Range of each number, times that of [`MapNoise::TYPICAL`].
 const RANGE: [f64; 2] = [0.03, 30.0];
 
 /// A recording from which trials are made. All slices have one entry per frame.
@@ -43,22 +43,26 @@ pub struct Trial {
     pub information: PoseInformation,
 }
 
-/// Which frames a trial leaves out of its map.
+/// Which frames a trial leaves out of its map, besides every second frame, and which views it asks
+/// for.
+///
+/// Views within a gap have mapped frames on both sides. Beyond an end of the map they have them on one
+/// side, like those of a robot that leaves the map, and their errors are larger.
 #[derive(Debug, Clone, Copy)]
 enum LeftOut {
-    /// Every second frame.
+    /// Nothing else; every second frame is asked for.
     Interleaved,
-    /// Every fifth of this many blocks, from the given one on, and every second frame elsewhere.
+    /// Every fifth of this many blocks, from the given one on.
     Blocks { count: usize, first: usize },
+    /// The last two fifths; the first half of them is asked for.
+    End,
+    /// The first two fifths; the last half of them is asked for.
+    Beginning,
 }
 
 /// Trials with small and with large gaps in the map.
-const PATTERNS: [LeftOut; 4] = [
+const PATTERNS: [LeftOut; 5] = [
     LeftOut::Interleaved,
-    LeftOut::Blocks {
-        count: 40,
-        first: 1,
-    },
     LeftOut::Blocks {
         count: 20,
         first: 0,
@@ -67,34 +71,37 @@ const PATTERNS: [LeftOut; 4] = [
         count: 10,
         first: 3,
     },
+    LeftOut::End,
+    LeftOut::Beginning,
 ];
 
 impl LeftOut {
-    /// Whether a frame is left out of the map.
-    fn leaves_out(self, row: usize, frame_count: usize) -> bool {
-        match self {
-            Self::Interleaved => row % 2 == 1,
-            Self::Blocks { .. } => row % 2 == 1 || self.is_in_gap(row, frame_count),
-        }
+    /// Whether a frame is in the map.
+    fn maps(self, row: usize, frame_count: usize) -> bool {
+        let fifth = row * 5 / frame_count;
+        let is_kept = match self {
+            Self::Interleaved => true,
+            Self::Blocks { count, first } => row * count / frame_count % 5 != first,
+            Self::End => fifth < 3,
+            Self::Beginning => fifth >= 2,
+        };
+        is_kept && row.is_multiple_of(2)
     }
 
     /// Whether the trial asks for a frame.
     fn asks(self, row: usize, frame_count: usize) -> bool {
+        let fifth = row * 5 / frame_count;
         match self {
             Self::Interleaved => row % 2 == 1,
-            Self::Blocks { .. } => self.is_in_gap(row, frame_count),
-        }
-    }
-
-    fn is_in_gap(self, row: usize, frame_count: usize) -> bool {
-        match self {
-            Self::Interleaved => false,
             Self::Blocks { count, first } => row * count / frame_count % 5 == first,
+            Self::End => fifth == 3,
+            Self::Beginning => fifth == 1,
         }
     }
 }
 
-/// Trials of all patterns whose views are matched with enough inliers.
+/// Trials of all patterns with the views whose inliers are enough and spread widely enough for an
+/// accepted pose.
 pub fn trials(recording: TrialRecording<'_>) -> Vec<Trial> {
     PATTERNS
         .iter()
@@ -110,7 +117,7 @@ fn trials_of(recording: TrialRecording<'_>, pattern: LeftOut) -> Vec<Trial> {
     } = recording;
     let frame_count = poses.len();
     let rows = |keep: &dyn Fn(usize) -> bool| (0..frame_count).filter(|&row| keep(row)).collect();
-    let mapped: Vec<usize> = rows(&|row| !pattern.leaves_out(row, frame_count));
+    let mapped: Vec<usize> = rows(&|row| pattern.maps(row, frame_count));
     let asked: Vec<usize> = rows(&|row| pattern.asks(row, frame_count));
 
     let mapped_poses: Vec<Pose> = mapped.iter().map(|&row| poses[row]).collect();
@@ -143,7 +150,7 @@ fn trials_of(recording: TrialRecording<'_>, pattern: LeftOut) -> Vec<Trial> {
                 &parameters,
             )?;
 
-            (found.inliers >= parameters.min_inliers).then(|| Trial {
+            found.is_supported(&parameters).then(|| Trial {
                 error: log(&found.pose.inv_mul(&poses[row])).to_vector(),
                 information: found.information,
             })
@@ -153,17 +160,16 @@ fn trials_of(recording: TrialRecording<'_>, pattern: LeftOut) -> Vec<Trial> {
 
 /// The noise under which the errors of the trials are most probable; `None` if there are too few
 /// trials.
-pub fn fitted_noise(trials: &[Trial], unit_m: f64) -> Option<MapNoise> {
+pub fn fitted_noise(trials: &[Trial]) -> Option<MapNoise> {
     if trials.len() < MIN_TRIALS {
         return None;
     }
 
-    let typical = MapNoise::typical(unit_m);
     let noise_at = |logarithms: Vector4<f64>| MapNoise {
-        translation_m: typical.translation_m * logarithms.x.exp(),
-        rotation_rad: typical.rotation_rad * logarithms.y.exp(),
-        design_effect: typical.design_effect * logarithms.z.exp(),
-        gap_scale: typical.gap_scale * logarithms.w.exp(),
+        design_effect: MapNoise::TYPICAL.design_effect * logarithms.x.exp(),
+        gap_scale: MapNoise::TYPICAL.gap_scale * logarithms.y.exp(),
+        pose_noise: MapNoise::TYPICAL.pose_noise * logarithms.z.exp(),
+        pose_drift: MapNoise::TYPICAL.pose_drift * logarithms.w.exp(),
     };
     let [least, most] = RANGE.map(f64::ln);
 
@@ -223,7 +229,7 @@ pub fn squared_length(trial: &Trial, noise: &MapNoise) -> Option<f64> {
 impl KeypointMap {
     /// Replaces the noise by the one measured in trials; keeps it if there are too few trials.
     pub fn measure_noise(&mut self, recording: TrialRecording<'_>) {
-        if let Some(noise) = fitted_noise(&trials(recording), self.unit_m) {
+        if let Some(noise) = fitted_noise(&trials(recording)) {
             self.noise = noise;
         }
     }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use nalgebra::{Matrix6, Point3, Vector2, Vector3, Vector6};
 use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera, Pose, PoseError, log};
 use seese3_core::keypoints::Keypoints;
-use seese3_core::statistics::coverage;
+use seese3_core::statistics::{Coverage, coverage};
 use seese3_robot::localization::{KeypointRoom, LocatedView, NotLocated, camera_of_views};
 use seese3_robot::matched_views::{
     Error, KeypointMap, MapNoise, Mapping, MappingParameters, PoseInformation, Trial,
@@ -508,20 +508,10 @@ fn drawn_trial(information: PoseInformation, noise: &MapNoise, random: &mut Rand
     Trial { error, information }
 }
 
-/// Oracle: the noise from which the errors are drawn; and the F distribution: 6 F(6, 5) · 3/5 is below
-/// the two thresholds with the probabilities 0.759 and 0.905 (SciPy 1.18, `scipy.stats.f`).
-#[test]
-fn the_noise_of_drawn_trials_is_found() {
-    let unit_m = 2.0;
-    let truth = MapNoise {
-        translation_m: 0.004,
-        rotation_rad: 0.002,
-        design_effect: 8.0,
-        gap_scale: 0.15,
-    };
-
+/// Trials with errors drawn from `noise`, at gaps of 0.01 to 1.
+fn drawn_trials(noise: &MapNoise, count: usize) -> Vec<Trial> {
     let mut random = Random::new(31);
-    let trials: Vec<Trial> = (0..2_000)
+    (0..count)
         .map(|_| {
             // Deviations of 0.2 to 5 mm, and of 1/2 of that in radians, with correlated axes.
             let size = 2e-4 * 25.0_f64.powf(random.uniform());
@@ -533,28 +523,128 @@ fn the_noise_of_drawn_trials_is_found() {
             let information = PoseInformation {
                 independent: (independent + independent.transpose()) * 0.5,
                 gap: 0.01 * 100.0_f64.powf(random.uniform()),
+                unit_m: 2.0,
             };
-            drawn_trial(information, &truth, &mut random)
+            drawn_trial(information, noise, &mut random)
         })
-        .collect();
+        .collect()
+}
 
-    let noise = fitted_noise(&trials, unit_m).unwrap();
+/// Coverage of the errors of trials under a noise.
+fn coverage_under(trials: &[Trial], noise: &MapNoise) -> Coverage {
+    let lengths: Vec<f64> = trials
+        .iter()
+        .map(|trial| squared_length_of(trial, noise).unwrap())
+        .collect();
+    coverage(&lengths)
+}
+
+const DRAWN: MapNoise = MapNoise {
+    design_effect: 8.0,
+    gap_scale: 0.05,
+    pose_noise: 0.002,
+    pose_drift: 0.01,
+};
+
+/// Oracle: the noise from which the errors are drawn; and the F distribution: 6 F(6, 5) · 3/5 is below
+/// the two thresholds with the probabilities 0.759 and 0.905 (SciPy 1.18, `scipy.stats.f`).
+#[test]
+fn the_noise_of_drawn_trials_is_found() {
+    let trials = drawn_trials(&DRAWN, 2_000);
+    let noise = fitted_noise(&trials).unwrap();
     for (name, found, drawn) in [
-        ("translation", noise.translation_m, truth.translation_m),
-        ("rotation", noise.rotation_rad, truth.rotation_rad),
-        ("design effect", noise.design_effect, truth.design_effect),
-        ("gap scale", noise.gap_scale, truth.gap_scale),
+        ("design effect", noise.design_effect, DRAWN.design_effect),
+        ("gap scale", noise.gap_scale, DRAWN.gap_scale),
+        ("pose noise", noise.pose_noise, DRAWN.pose_noise),
+        ("pose drift", noise.pose_drift, DRAWN.pose_drift),
     ] {
         near(name, found / drawn, 1.0, 0.3);
     }
 
-    let lengths: Vec<f64> = trials
-        .iter()
-        .map(|trial| squared_length_of(trial, &noise).unwrap())
-        .collect();
-    let coverage = coverage(&lengths);
+    let coverage = coverage_under(&trials, &noise);
     near("within 68 %", coverage.within_68, 0.759, 0.04);
     near("within 95 %", coverage.within_95, 0.905, 0.03);
 
-    assert_eq!(fitted_noise(&trials[..29], unit_m), None);
+    assert_eq!(fitted_noise(&trials[..29]), None);
+}
+
+/// Oracle: the noise from which the errors are drawn. Without one of its parts, the ellipsoids do not
+/// hold their shares of the errors.
+#[test]
+fn each_part_of_the_noise_is_needed() {
+    let trials = drawn_trials(&DRAWN, 1_000);
+    let independent = MapNoise {
+        design_effect: 1.0,
+        ..DRAWN
+    };
+    let everywhere_alike = MapNoise {
+        gap_scale: 1e3,
+        ..DRAWN
+    };
+    let without_noise = MapNoise {
+        pose_noise: 1e-6,
+        ..DRAWN
+    };
+    let without_drift = MapNoise {
+        pose_drift: 1e-6,
+        ..DRAWN
+    };
+
+    for noise in [independent, everywhere_alike, without_noise, without_drift] {
+        let coverage = coverage_under(&trials, &noise);
+        let is_held = coverage.within_68 > 0.6 && coverage.within_95 > 0.85;
+        assert!(!is_held, "{noise:?}: {coverage:?}");
+    }
+}
+
+/// Poses with the errors that `error` gives, in order.
+fn stated_with(poses: &[Pose], mut error: impl FnMut() -> Pose) -> Vec<Pose> {
+    poses.iter().map(|pose| pose * error()).collect()
+}
+
+/// Oracle: the definition of a covariance, for views whose true pose is stated with the errors of the
+/// map. The errors of the poses are independent, or drift like a random walk.
+#[test]
+fn errors_of_stated_poses_are_part_of_the_covariance() {
+    let world = World::new(Scene::in_box(POINTS, 1), camera_path(120), 0.5);
+    let keypoints = world.keypoints();
+
+    let mut random = Random::new(12);
+    let mut small = move |m: f64| Pose::new(random.normals() * m, random.normals() * (0.5 * m));
+    let mut walk = Pose::identity();
+    let independent = stated_with(&world.poses, || small(0.004));
+    let drifting = stated_with(&world.poses, || {
+        walk *= small(0.002);
+        walk
+    });
+
+    for (name, stated) in [("independent", independent), ("drifting", drifting)] {
+        // The map lacks a stretch, and every second frame elsewhere.
+        let (asked, mapped): (Vec<usize>, Vec<usize>) =
+            (0..120).partition(|&row| row % 2 == 1 || (60..70).contains(&row));
+        let poses: Vec<Pose> = mapped.iter().map(|&row| stated[row]).collect();
+        let known: Vec<Keypoints> = mapped.iter().map(|&row| keypoints[row].clone()).collect();
+        let mapping = Mapping::new(&poses, &known, world.camera, MappingParameters::default());
+        let mut map = mapping.unwrap().map(&|| ());
+        map.measure_noise(TrialRecording {
+            poses: &poses,
+            keypoints: &known,
+            camera: world.camera,
+        });
+
+        let room = world.room_of(&poses, map);
+        let lengths: Vec<f64> = asked
+            .iter()
+            .filter_map(|&row| {
+                let found = located(&room, &keypoints[row], &world.camera).ok()?;
+                Some(squared_length(&found, &stated[row]))
+            })
+            .collect();
+        let coverage = coverage(&lengths);
+        assert!(lengths.len() >= 60, "{name}: {} answers", lengths.len());
+        assert!(
+            (0.5..0.95).contains(&coverage.within_68) && coverage.within_95 >= 0.8,
+            "{name}: {coverage:?}"
+        );
+    }
 }
