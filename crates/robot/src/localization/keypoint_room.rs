@@ -217,14 +217,14 @@ impl KeypointRoom {
     fn novelty(&self, matched: &MatchedView, pose: &PoseWithCovariance) -> f64 {
         let MatchingParameters {
             min_inliers,
-            min_spread,
+            min_support,
             max_position_deviation,
             max_rotation_deviation_rad,
             ..
         } = self.parameters;
         let ratios = [
             min_inliers as f64 / matched.inliers as f64,
-            min_spread / matched.spread,
+            min_support / matched.support(),
             pose.position_deviation_m() / (max_position_deviation * self.map.unit_m),
             pose.rotation_deviation_rad() / max_rotation_deviation_rad,
         ];

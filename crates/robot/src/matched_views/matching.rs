@@ -61,7 +61,12 @@ pub struct MatchedView {
 impl MatchedView {
     /// Whether the inliers are enough, and spread widely enough, for an accepted pose.
     pub fn is_supported(&self, parameters: &MatchingParameters) -> bool {
-        self.inliers >= parameters.min_inliers && self.spread >= parameters.min_spread
+        self.inliers >= parameters.min_inliers && self.support() >= parameters.min_support
+    }
+
+    /// Number of inliers times their spread: few inliers have to be spread more widely.
+    pub fn support(&self) -> f64 {
+        self.inliers as f64 * self.spread
     }
 }
 

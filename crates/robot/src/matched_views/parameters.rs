@@ -75,9 +75,10 @@ pub struct MatchingParameters {
     pub confident_inliers: usize,
     /// Minimum number of unique inliers of an accepted pose.
     pub min_inliers: usize,
-    /// Minimum spread of the inliers of an accepted pose: the product of the standard deviations of
-    /// their positions along both axes, fractions of the image's width and height.
-    pub min_spread: f64,
+    /// Minimum number of unique inliers of an accepted pose times their spread, which is the product
+    /// of the standard deviations of their positions along both axes, fractions of the image's width
+    /// and height. A hundred inliers over the whole image have 8.
+    pub min_support: f64,
     /// Largest standard deviation of an accepted position, units (median depths of the map).
     pub max_position_deviation: f64,
     /// Largest standard deviation of an accepted rotation, radians.
@@ -123,7 +124,7 @@ impl Default for MatchingParameters {
             deviation_px: 0.7,
             confident_inliers: 150,
             min_inliers: 90,
-            min_spread: 0.016,
+            min_support: 4.3,
             max_position_deviation: 0.05,
             max_rotation_deviation_rad: 3_f64.to_radians(),
             min_log_focal: 0.05,
