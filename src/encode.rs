@@ -317,8 +317,8 @@ fn say_keypoints(map: &KeypointMap) {
         count as f64 / map.frames.len() as f64,
         map.unit_m,
         map.epipolar_px,
-        map.noise.translation_m,
-        map.noise.rotation_rad.to_degrees(),
+        map.noise.pose_noise * map.unit_m,
+        map.noise.pose_noise.to_degrees(),
         map.noise.design_effect,
         map.noise.gap_scale
     ));

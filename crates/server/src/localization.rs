@@ -194,7 +194,7 @@ impl Retrieved {
     ) -> Result<&'a ServedNavigator, Error> {
         // At least one frame is retrieved.
         let place = self.places.first().ok_or(Error::Internal)?;
-        Ok(navigator_of(served, &place.room)?)
+        navigator_of(served, &place.room)
     }
 
     fn query(&self) -> MapQuery<'_> {

@@ -234,33 +234,11 @@ fn ready(
 
     let served = snapshot.navigator(&room, &adapter)?;
     let navigator = &served.navigator;
-    let is_image = matches!(
-        &source,
-        Some(pb::View {
-            view: Some(pb::view::View::Image(_))
-        })
-    );
-    let image = match (&source_camera, is_image, &source_pose) {
-        (Some(camera), true, None) => {
-            let fields = ViewFields {
-                view: "source",
-                camera: "source_camera",
-            };
-            let room = std::slice::from_ref(snapshot.room(&room)?);
-            ImageView::of(snapshot, fields, source.as_ref(), Some(camera), room)?
-        }
-        _ => None,
+    let matched = match &source_pose {
+        None => MatchedSource::of(snapshot, &served, source.as_ref(), source_camera.as_ref())?,
+        Some(_) => MatchedSource::default(),
     };
-    let tried = match &image {
-        Some(image) => {
-            let room = std::slice::from_ref(snapshot.room(&room)?);
-            image.matched(room, &Cancellation::default())?.pop()
-        }
-        None => None,
-    };
-
-    let known = image.as_ref();
-    let source = match known.and_then(|image| image.feature_for(&served.adapter)) {
+    let source = match matched.feature {
         Some(feature) => Source::Feature(feature),
         None => convert::source("source", source, &served.adapter, snapshot)?,
     };
@@ -284,13 +262,7 @@ fn ready(
             other => Error::from(other),
         })?;
 
-    let tried = tried.map(|tried| tried.found);
-    if let Some(Err(why)) = &tried
-        && let Some(error) = contradicted("source_camera", Some(why))
-    {
-        return Err(error);
-    }
-    let start = believed_start(&served, &source, &view, tried)?;
+    let start = believed_start(&served, &source, &view, matched.found)?;
     view.pose = Some(start.pose);
 
     let goal = goal_pose(goal, navigator, &room)?;
@@ -318,6 +290,54 @@ fn ready(
         least_arrival_probability,
         planner,
     })
+}
+
+/// A source image whose keypoints were matched with those of the room.
+#[derive(Default)]
+struct MatchedSource {
+    /// `None` if they were not tried.
+    found: Option<Result<LocatedView, NotLocated>>,
+    /// The feature of the same encoder pass, if it is that of the adapter.
+    feature: Option<Vec<f32>>,
+}
+
+impl MatchedSource {
+    /// Matches the source if it is an image and its camera is given.
+    ///
+    /// # Errors
+    /// As [`ImageView::of`] and [`ImageView::matched`]; [`Error::Invalid`] on `source_camera` if the
+    /// matches contradict it.
+    fn of(
+        snapshot: &Snapshot,
+        served: &ServedNavigator,
+        source: Option<&pb::View>,
+        camera: Option<&pb::ViewCamera>,
+    ) -> Result<Self, Error> {
+        if camera.is_none() {
+            return Ok(Self::default());
+        }
+
+        let fields = ViewFields {
+            view: "source",
+            camera: "source_camera",
+        };
+        let room = snapshot.room(served.navigator.room().id().as_str())?;
+        let room = std::slice::from_ref(room);
+        let Some(image) = ImageView::of(snapshot, fields, source, camera, room)? else {
+            return Ok(Self::default());
+        };
+
+        let tried = image.matched(room, &Cancellation::default())?.pop();
+        let found = tried.map(|tried| tried.found);
+        let unmatched = found.as_ref().and_then(|found| found.as_ref().err());
+        if let Some(error) = contradicted("source_camera", unmatched) {
+            return Err(error);
+        }
+        Ok(Self {
+            feature: image.feature_for(&served.adapter),
+            found,
+        })
+    }
 }
 
 /// The start pose: recorded or given by the caller, else estimated from the view. `tried` is the

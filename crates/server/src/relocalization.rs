@@ -98,14 +98,20 @@ fn answer(
     ranked(tried, by_latent.as_ref(), shown)
 }
 
+/// Rooms under one adapter, each with its map.
+struct RoomsWithMaps {
+    served: Vec<Arc<ServedNavigator>>,
+    maps: Vec<Arc<Map>>,
+}
+
 fn rooms_with_maps(
     snapshot: &Snapshot,
     rooms: &[String],
     adapter: &str,
-) -> Result<(Vec<Arc<ServedNavigator>>, Vec<Arc<Map>>), Error> {
+) -> Result<RoomsWithMaps, Error> {
     let served = rooms_to_track_in(snapshot, rooms, adapter)?;
     let maps = maps(&served)?;
-    Ok((served, maps))
+    Ok(RoomsWithMaps { served, maps })
 }
 
 /// The rooms compared by the latents of the views.
@@ -117,7 +123,7 @@ struct ByLatent {
 
 impl ByLatent {
     fn of(
-        (served, maps): (Vec<Arc<ServedNavigator>>, Vec<Arc<Map>>),
+        RoomsWithMaps { served, maps }: RoomsWithMaps,
         views: Vec<pb::View>,
         top_k: usize,
         snapshot: &Snapshot,

@@ -274,7 +274,7 @@ impl KeypointRoom {
         let is_contradicted =
             deviations > gate.max_deviations || inlier_ratio > gate.max_inlier_ratio;
 
-        is_contradicted.then(|| NotLocated::CameraContradicted {
+        is_contradicted.then_some(NotLocated::CameraContradicted {
             stated,
             fitted: stated * factor,
             inliers: matched.matches.len(),

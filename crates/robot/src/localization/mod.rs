@@ -78,7 +78,7 @@ pub struct NotInRoom {
     /// Why its keypoints do not locate it, if they were tried.
     pub unmatched: Option<NotLocated>,
     /// The estimate from the most similar frames, which is not to be trusted.
-    pub nearest: Option<AdapterEstimate>,
+    pub nearest: Option<Box<AdapterEstimate>>,
 }
 
 impl RoomLocalizer<'_> {
@@ -135,7 +135,7 @@ impl RoomLocalizer<'_> {
             (nearest, novelty) => Err(NotInRoom {
                 novelty: by_keypoints.or(novelty).unwrap_or(f64::INFINITY),
                 unmatched,
-                nearest,
+                nearest: nearest.map(Box::new),
             }),
         }
     }

@@ -65,7 +65,7 @@ impl BelievedStart {
                 nearest, novelty, ..
             }) => Some(Self {
                 out_of_distribution: Some(novelty),
-                ..Self::of_adapter(nearest?)
+                ..Self::of_adapter(*nearest?)
             }),
         }
     }

@@ -43,6 +43,8 @@ pub struct FrameEvidence {
     pub matches_room: bool,
     /// Whether the match is certain: hardly any frame of another room is that near.
     pub matches_certainly: bool,
+    /// Whether matched keypoints prove the place.
+    pub is_proven: bool,
     /// Continuity with the previous frames.
     pub continuity: Continuity,
 }
@@ -72,6 +74,7 @@ impl TrackingHealth {
     #[must_use]
     pub fn after(self, evidence: FrameEvidence) -> Self {
         match self {
+            _ if evidence.is_proven => Self::confirmed(),
             Self::NotStarted if evidence.matches_room => Self::ONE_MATCH,
             Self::NotStarted => Self::NEWLY_LOST,
             Self::Consistent { score, confirmed } => {
@@ -160,11 +163,13 @@ mod tests {
     const MATCH: FrameEvidence = FrameEvidence {
         matches_room: true,
         matches_certainly: true,
+        is_proven: false,
         continuity: Continuity::Continuous,
     };
     const MISMATCH: FrameEvidence = FrameEvidence {
         matches_room: false,
         matches_certainly: false,
+        is_proven: false,
         continuity: Continuity::Continuous,
     };
     const JUMP: FrameEvidence = FrameEvidence {

@@ -117,14 +117,12 @@ impl Tracker {
         state.health = state.health.after(FrameEvidence {
             matches_room,
             matches_certainly: matches_room && seen.leading.matched.is_certain,
+            is_proven: matches_room && seen.leading.is_proven,
             continuity: match continuity {
                 Continuity::Jump if seen.is_seen_by_other => Continuity::Continuous,
                 continuity => continuity,
             },
         });
-        if seen.leading.is_proven && matches_room {
-            state.health = TrackingHealth::confirmed();
-        }
         state.frames_off_map = if matches_room {
             0
         } else {
