@@ -63,7 +63,7 @@ pub use extension::{ExtendedRoom, OtherFeatures};
 pub use garbage::{Garbage, GarbageFile};
 pub use removal::Removed;
 pub use resource::{Kind, ResourceName, ResourceNameError};
-pub use room_keypoints::RoomKeypoints;
+pub use room_keypoints::{HeaderError, KeypointsHeader, RoomKeypoints};
 pub use rooms::{RoomContents, RoomSummary, StoredRoom, check_features};
 pub use stored_adapter::{BaseAdapter, RoomFit, StoredAdapter};
 pub use verification::Finding;

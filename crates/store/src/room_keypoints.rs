@@ -12,7 +12,7 @@ use super::Error;
 use super::manifest::ObjectRef;
 use super::tensors::{TensorReader, TensorWriter};
 use seese3_core::geometry::CameraIntrinsics;
-use seese3_core::keypoints::KeypointSource;
+use seese3_core::keypoints::{KeypointSource, MAX_KEYPOINTS};
 use seese3_core::nalgebra::Vector2;
 use seese3_robot::matched_views::{
     COMPRESSED, DescriptorBasis, KeypointMap, MapNoise, MappedKeypoints,
@@ -24,6 +24,8 @@ const POSITION_STEPS: f32 = u16::MAX as f32;
 const MOST_INVERSE_DEPTH: f64 = 16.0;
 /// Largest relative deviation that can be stored.
 const MOST_DEVIATION: f32 = 0.255;
+/// Largest number of a [`KeypointsHeader`]; its reciprocal is the smallest.
+const LARGEST: f64 = 1e12;
 
 /// The keypoints of a room's frames and where they come from.
 #[derive(Debug, Clone)]
@@ -34,17 +36,10 @@ pub struct RoomKeypoints {
     pub map: Arc<KeypointMap>,
 }
 
-/// The keypoints of a room in its manifest. The object has the tensors
-///
-/// - `counts` (n,) i64: number of keypoints of each frame;
-/// - `positions` (k, 2) u16: fractions of the image's width and height, times 65535;
-/// - `inverse_depths` (k,) u16: 1 / z in the camera frame times the unit, times 65535 / 16;
-/// - `deviations` (k,) u8: relative deviations of the inverse depths, times 1000;
-/// - `descriptors` (k, 32) i8: compressed descriptors times 200;
-/// - `basis.mean` (d,) and `basis.axes` (d, 32) f32: a descriptor is compressed by subtracting the
-///   mean, multiplying by the axes and scaling to unit length.
+/// What the file of a room's keypoints does not contain: their source and the numbers of their map.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct KeypointsEntry {
+pub struct KeypointsHeader {
+    /// The encoder and its outputs.
     pub source: KeypointSource,
     /// The camera of all frames.
     pub camera: CameraIntrinsics,
@@ -54,25 +49,100 @@ pub struct KeypointsEntry {
     pub epipolar_px: f64,
     /// Noise of the map, from which covariances follow.
     pub noise: MapNoise,
-    pub object: ObjectRef,
 }
 
-impl KeypointsEntry {
-    pub fn new(keypoints: &RoomKeypoints, object: ObjectRef) -> Self {
-        let map = &keypoints.map;
-        Self {
-            source: keypoints.source.clone(),
-            camera: map.camera,
-            unit_m: map.unit_m,
-            epipolar_px: map.epipolar_px,
-            noise: map.noise,
-            object,
+/// A number of a [`KeypointsHeader`] that no map has.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("{field} must be above 0 and at most {LARGEST:e}, but is {value}")]
+pub struct HeaderError {
+    /// The field, named as in [`KeypointsHeader`] or in [`MapNoise`].
+    pub field: &'static str,
+    /// Its value.
+    pub value: f64,
+}
+
+impl KeypointsHeader {
+    /// Checks that depths and covariances computed with these numbers are finite.
+    ///
+    /// # Errors
+    /// [`HeaderError`] for the first number that is not above 0, or too large.
+    pub fn check(&self) -> Result<(), HeaderError> {
+        let MapNoise {
+            translation_m,
+            rotation_rad,
+            design_effect,
+            gap_scale,
+        } = self.noise;
+
+        let numbers = [
+            ("unit_m", self.unit_m),
+            ("epipolar_px", self.epipolar_px),
+            ("translation_m", translation_m),
+            ("rotation_rad", rotation_rad),
+            ("design_effect", design_effect),
+            ("gap_scale", gap_scale),
+        ];
+        let is_wrong = |(_, value): &(_, f64)| !(LARGEST.recip()..=LARGEST).contains(value);
+        match numbers.into_iter().find(is_wrong) {
+            Some((field, value)) => Err(HeaderError { field, value }),
+            None => Ok(()),
         }
     }
 }
 
+impl RoomKeypoints {
+    /// Everything but the keypoints themselves.
+    pub fn header(&self) -> KeypointsHeader {
+        let map = &self.map;
+        KeypointsHeader {
+            source: self.source.clone(),
+            camera: map.camera,
+            unit_m: map.unit_m,
+            epipolar_px: map.epipolar_px,
+            noise: map.noise,
+        }
+    }
+
+    /// The keypoints as the file of the store, safetensors:
+    ///
+    /// - `counts` (n,) i64: number of keypoints of each frame, at most [`MAX_KEYPOINTS`];
+    /// - `positions` (k, 2) u16: fractions of the image's width and height, times 65535;
+    /// - `inverse_depths` (k,) u16: 1 / z in the camera frame times the unit, times 65535 / 16;
+    /// - `deviations` (k,) u8: relative deviations of the inverse depths, times 1000;
+    /// - `descriptors` (k, 32) i8: compressed descriptors times 200;
+    /// - `basis.mean` (d,) and `basis.axes` (d, 32) f32: a descriptor is compressed by subtracting
+    ///   the mean, multiplying by the axes and scaling to unit length.
+    ///
+    /// # Errors
+    /// [`Error::Damaged`] if the tensors cannot be serialized.
+    pub fn to_bytes(&self) -> Result<Vec<u8>, Error> {
+        keypoints_file(&self.map)
+    }
+
+    /// Keypoints of `frame_count` frames from the bytes of [`RoomKeypoints::to_bytes`]. The bytes may
+    /// come from anywhere.
+    ///
+    /// # Errors
+    /// [`Error::Damaged`] if a number of the header or the bytes cannot be those of a map.
+    pub fn from_bytes(
+        header: KeypointsHeader,
+        bytes: &[u8],
+        frame_count: usize,
+    ) -> Result<Self, Error> {
+        read_keypoints("keypoints", bytes, header, frame_count)
+    }
+}
+
+/// The keypoints of a room in its manifest. The object is that of [`RoomKeypoints::to_bytes`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct KeypointsEntry {
+    #[serde(flatten)]
+    pub header: KeypointsHeader,
+    pub object: ObjectRef,
+}
+
 /// Serializes the keypoints of a room.
-pub fn keypoints_file(map: &KeypointMap) -> Result<Vec<u8>, Error> {
+fn keypoints_file(map: &KeypointMap) -> Result<Vec<u8>, Error> {
     let frames = || map.frames.iter();
     let count: usize = frames().map(MappedKeypoints::len).sum();
     let mut tensors = TensorWriter::default();
@@ -116,7 +186,7 @@ pub fn keypoints_file(map: &KeypointMap) -> Result<Vec<u8>, Error> {
 pub fn read_keypoints(
     file: &str,
     bytes: &[u8],
-    entry: KeypointsEntry,
+    header: KeypointsHeader,
     frame_count: usize,
 ) -> Result<RoomKeypoints, Error> {
     let damaged = |problem: String| Error::Damaged {
@@ -124,7 +194,7 @@ pub fn read_keypoints(
         problem: problem.into(),
     };
 
-    entry.check().map_err(damaged)?;
+    header.check().map_err(|error| damaged(error.to_string()))?;
     let tensors = TensorReader::new(file, bytes)?;
     let columns = Columns::read(&tensors)?;
     columns.check(frame_count).map_err(damaged)?;
@@ -134,46 +204,17 @@ pub fn read_keypoints(
         .ok_or_else(|| damaged("has a descriptor basis of a wrong shape".to_owned()))?;
 
     let map = KeypointMap {
-        camera: entry.camera,
-        unit_m: entry.unit_m,
-        epipolar_px: entry.epipolar_px,
-        noise: entry.noise,
+        camera: header.camera,
+        unit_m: header.unit_m,
+        epipolar_px: header.epipolar_px,
+        noise: header.noise,
         basis,
-        frames: columns.frames(entry.unit_m),
+        frames: columns.frames(header.unit_m),
     };
     Ok(RoomKeypoints {
-        source: entry.source,
+        source: header.source,
         map: Arc::new(map),
     })
-}
-
-impl KeypointsEntry {
-    /// Checks that the numbers are those of a map.
-    fn check(&self) -> Result<(), String> {
-        let MapNoise {
-            design_effect,
-            gap_scale,
-            pose_noise,
-            pose_drift,
-        } = self.noise;
-        let numbers = [
-            self.unit_m,
-            self.epipolar_px,
-            design_effect,
-            gap_scale,
-            pose_noise,
-            pose_drift,
-        ];
-
-        let is_positive = |value: &f64| value.is_finite() && *value > 0.0;
-        if numbers.iter().all(is_positive) {
-            Ok(())
-        } else {
-            Err(format!(
-                "unit, epipolar error and noise of the map must be above 0, but are {numbers:?}"
-            ))
-        }
-    }
 }
 
 /// The tensors with one entry per frame or per keypoint.
@@ -210,13 +251,17 @@ impl Columns {
             && self.deviations.len() == count
             && self.descriptors.dim() == (count, COMPRESSED);
 
-        if is_consistent {
-            Ok(())
-        } else {
-            Err(format!(
+        if !is_consistent {
+            return Err(format!(
                 "has keypoints of {} frames whose tensors contradict each other; the room has {frame_count} frames",
                 self.counts.len()
-            ))
+            ));
+        }
+        match self.counts.iter().max() {
+            Some(&most) if most > MAX_KEYPOINTS as i64 => Err(format!(
+                "has {most} keypoints in one frame; at most {MAX_KEYPOINTS} are possible"
+            )),
+            _ => Ok(()),
         }
     }
 
@@ -313,7 +358,7 @@ mod tests {
         }
     }
 
-    fn entry() -> KeypointsEntry {
+    fn header() -> KeypointsHeader {
         serde_json::from_value(serde_json::json!({
             "source": {
                 "feature": seese3_core::features::FeatureSource::imported("f", 0),
@@ -327,7 +372,6 @@ mod tests {
             "noise": {
                 "design_effect": 2.0, "gap_scale": 0.1, "pose_noise": 0.1, "pose_drift": 0.1,
             },
-            "object": { "file": "keypoints-0.safetensors", "sha256": "", "bytes": 0 },
         }))
         .unwrap()
     }
@@ -349,7 +393,7 @@ mod tests {
     /// 65535 / 16 steps in an inverse unit of 2 m, a deviation steps of 0.001.
     #[test]
     fn tensors_are_read_by_the_format() {
-        let read = read_keypoints("k.safetensors", &parts().file(), entry(), 2).unwrap();
+        let read = read_keypoints("k.safetensors", &parts().file(), header(), 2).unwrap();
         let [first, second] = read.map.frames.as_slice() else {
             panic!("two frames")
         };
@@ -367,7 +411,7 @@ mod tests {
         let changed = |change: &dyn Fn(&mut Parts)| {
             let mut parts = parts();
             change(&mut parts);
-            read_keypoints("k.safetensors", &parts.file(), entry(), 2)
+            read_keypoints("k.safetensors", &parts.file(), header(), 2)
         };
         let word = "contradict";
         refused(changed(&|parts| parts.counts = vec![1, 3]), word);
@@ -386,6 +430,18 @@ mod tests {
             word,
         );
 
+        let of_one_frame = |count: usize| {
+            changed(&|parts| {
+                parts.counts = vec![count as i64, 0];
+                parts.positions = vec![[1, 2]; count];
+                parts.inverse_depths = vec![10; count];
+                parts.deviations = vec![7; count];
+                parts.descriptors = vec![1; count * COMPRESSED];
+            })
+        };
+        assert!(of_one_frame(600).is_ok());
+        refused(of_one_frame(601), "601 keypoints in one frame");
+
         let word = "basis";
         refused(changed(&|parts| parts.mean.push(1.0)), word);
         refused(changed(&|parts| parts.mean[0] = f32::NAN), word);
@@ -401,18 +457,18 @@ mod tests {
     #[test]
     fn numbers_of_the_manifest_that_are_not_positive_are_refused() {
         let file = parts().file();
-        for bad in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+        for bad in [0.0, -1.0, 1e-13, 1e13, f64::NAN, f64::INFINITY] {
             for change in [
-                (|entry, bad| entry.unit_m = bad) as fn(&mut KeypointsEntry, f64),
-                |entry, bad| entry.epipolar_px = bad,
-                |entry, bad| entry.noise.pose_noise = bad,
-                |entry, bad| entry.noise.pose_drift = bad,
-                |entry, bad| entry.noise.design_effect = bad,
-                |entry, bad| entry.noise.gap_scale = bad,
+                (|header, bad| header.unit_m = bad) as fn(&mut KeypointsHeader, f64),
+                |header, bad| header.epipolar_px = bad,
+                |header, bad| header.noise.pose_noise = bad,
+                |header, bad| header.noise.pose_drift = bad,
+                |header, bad| header.noise.design_effect = bad,
+                |header, bad| header.noise.gap_scale = bad,
             ] {
-                let mut entry = entry();
-                change(&mut entry, bad);
-                refused(read_keypoints("k.safetensors", &file, entry, 2), "above 0");
+                let mut header = header();
+                change(&mut header, bad);
+                refused(read_keypoints("k.safetensors", &file, header, 2), "above 0");
             }
         }
     }
@@ -424,9 +480,12 @@ mod tests {
         tensors.i64("counts", &[2], [0, 0].into_iter());
         let file = tensors.finish("keypoints").unwrap();
         refused(
-            read_keypoints("k.safetensors", &file, entry(), 2),
+            read_keypoints("k.safetensors", &file, header(), 2),
             "'positions'",
         );
-        refused(read_keypoints("k.safetensors", b"nonsense", entry(), 2), "");
+        refused(
+            read_keypoints("k.safetensors", b"nonsense", header(), 2),
+            "",
+        );
     }
 }

@@ -8,7 +8,7 @@ use super::manifest::{self, ObjectRef, SCHEMA};
 use super::room_files::{
     features_file, frames_file, names_file, read_features, read_frames, read_names,
 };
-use super::room_keypoints::{KeypointsEntry, RoomKeypoints, keypoints_file, read_keypoints};
+use super::room_keypoints::{KeypointsEntry, RoomKeypoints, read_keypoints};
 use super::{ATTEMPTS, Defaults, Error, Kind, Published, Store, folder_of, revision_path};
 use seese3_core::Cause;
 use seese3_core::adapter::TrainingRecord;
@@ -154,10 +154,12 @@ fn features_to_keep(newest: &RoomBody, published: &[FeaturesEntry]) -> Vec<Featu
 /// camera, or features of another encoder replace those of the same encoder pass.
 fn keypoints_to_keep(newest: &RoomBody, next: &RoomBody) -> Option<KeypointsEntry> {
     let known = newest.keypoints.clone()?;
-    let is_replaced = next.features.iter().any(|entry| {
-        entry.source.name == known.source.feature.name && entry.source != known.source.feature
-    });
-    let is_same_camera = next.provenance.camera == Some(known.camera);
+    let feature = &known.header.source.feature;
+    let is_replaced = next
+        .features
+        .iter()
+        .any(|entry| entry.source.name == feature.name && entry.source != *feature);
+    let is_same_camera = next.provenance.camera == Some(known.header.camera);
     (is_same_camera && !is_replaced).then_some(known)
 }
 
@@ -380,9 +382,12 @@ impl Store {
 
         let keypoints = match keypoints {
             Some(keypoints) => {
-                let bytes = keypoints_file(&keypoints.map)?;
+                let bytes = keypoints.to_bytes()?;
                 let object = self.write_object(folder, "keypoints", "safetensors", bytes);
-                Some(KeypointsEntry::new(keypoints, object.await?))
+                Some(KeypointsEntry {
+                    header: keypoints.header(),
+                    object: object.await?,
+                })
             }
             None => None,
         };
@@ -561,7 +566,7 @@ impl Store {
             created: body.created,
             frame_count: body.frame_count,
             features: sources.collect(),
-            keypoints: body.keypoints.map(|entry| entry.source),
+            keypoints: body.keypoints.map(|entry| entry.header.source),
             provenance: body.provenance,
         })
     }
@@ -725,7 +730,8 @@ impl Store {
         let keypoints = match body.keypoints {
             Some(entry) => {
                 let (file, bytes) = self.read_object(&folder, &entry.object).await?;
-                Some(read_keypoints(&file, &bytes, entry, room.frame_count())?)
+                let frame_count = room.frame_count();
+                Some(read_keypoints(&file, &bytes, entry.header, frame_count)?)
             }
             None => None,
         };

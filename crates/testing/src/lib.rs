@@ -7,6 +7,8 @@
     reason = "a failed step is a failed test"
 )]
 
+#[cfg(feature = "world")]
+pub mod keypoint_map;
 pub mod keypoint_scene;
 pub mod oracle_room;
 pub mod recording;

@@ -3,61 +3,24 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use ndarray::{Array1, Array2};
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::keypoints::KeypointSource;
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
-use seese3_robot::matched_views::{
-    COMPRESSED, DescriptorBasis, KeypointMap, MapNoise, MappedKeypoints,
-};
 use seese3_store::{Error, OtherFeatures, RoomContents, RoomKeypoints, Store};
 
 use crate::store::{files, stored};
-use seese3_testing::keypoint_scene::{Random, distorted_camera};
+use seese3_testing::keypoint_map::{UNIT_M, keypoint_map};
+use seese3_testing::keypoint_scene::distorted_camera;
 use seese3_testing::near;
 use seese3_testing::recording::{room, set};
 
 /// Number of frames of `room("a")`.
 const FRAMES: usize = 300;
-/// Median depth, meters.
-const UNIT_M: f64 = 2.5;
 
 /// Keypoints of random numbers within their ranges: `count` in each frame but every fifth.
 fn keypoints(frame_count: usize, count: usize) -> RoomKeypoints {
-    let mut random = Random::new(4);
-    let frames = (0..frame_count)
-        .map(|row| {
-            let count = if row % 5 == 4 { 0 } else { count };
-            let mut frame = MappedKeypoints::default();
-            for _ in 0..count {
-                let point = [random.uniform() as f32, random.uniform() as f32];
-                frame.points.push(point.into());
-                frame
-                    .inverse_depths
-                    .push((random.between(0.02, 8.0) / UNIT_M) as f32);
-                frame.deviations.push(random.between(0.002, 0.2) as f32);
-                let byte = |_| random.between(-127.0, 128.0).floor() as i8;
-                frame.descriptors.extend((0..COMPRESSED).map(byte));
-            }
-            frame
-        })
-        .collect();
-
-    let mean = Array1::from_shape_fn(64, |_| random.normal() as f32);
-    let axes = Array2::from_shape_fn((64, COMPRESSED), |_| random.normal() as f32);
-    let map = KeypointMap {
-        camera: room("a").provenance().camera.unwrap(),
-        unit_m: UNIT_M,
-        epipolar_px: 0.7,
-        noise: MapNoise {
-            design_effect: 12.0,
-            gap_scale: 0.3,
-            pose_noise: 0.001,
-            pose_drift: 0.003,
-        },
-        basis: DescriptorBasis::from_parts(mean, axes).unwrap(),
-        frames,
-    };
+    let camera = room("a").provenance().camera.unwrap();
+    let map = keypoint_map(camera, frame_count, count);
     let source = KeypointSource {
         feature: set("f", 1.0).source().clone(),
         positions: "kpt".to_owned(),
