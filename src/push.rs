@@ -12,7 +12,7 @@ use seese3_client::proto::v1 as pb;
 use seese3_core::features::Features;
 use seese3_core::geometry::Pose;
 use seese3_server::{camera_to_wire, source_to_wire};
-use seese3_store::{Kind, ResourceName, StoredRoom};
+use seese3_store::{KeypointsHeader, Kind, ResourceName, RoomKeypoints, StoredRoom};
 
 /// Target size of a message, bytes, well below the servers' limit. A message holds at least one
 /// frame.
@@ -56,7 +56,7 @@ impl Push {
         let (revision, created, served) = match self.name.kind {
             Kind::Room => {
                 let stored = store.load_room(&self.name.name, self.name.revision).await?;
-                let messages = room_messages(&stored, self.upload(&stored, &target))?;
+                let messages = room_messages(&stored, self.upload(&stored, &target)?)?;
                 let answer = client.create_room(tokio_stream::iter(messages)).await?;
                 (answer.revision, answer.created, answer.served)
             }
@@ -113,7 +113,7 @@ impl Push {
     }
 
     /// The description of a room's upload.
-    fn upload(&self, stored: &StoredRoom, target: &ResourceName) -> pb::RoomUpload {
+    fn upload(&self, stored: &StoredRoom, target: &ResourceName) -> anyhow::Result<pb::RoomUpload> {
         let provenance = stored.room.provenance();
         // An extended room keeps its own format and license.
         let own = |words: &String| {
@@ -124,7 +124,16 @@ impl Push {
             }
         };
 
-        pb::RoomUpload {
+        let keypoints = match &stored.keypoints {
+            Some(_) if self.extend => {
+                say("the keypoints stay behind: frames that extend a room have none");
+                None
+            }
+            Some(keypoints) => Some(keypoints_upload(stored, keypoints)?),
+            None => None,
+        };
+
+        Ok(pb::RoomUpload {
             name: target.to_string(),
             features: stored
                 .features
@@ -137,9 +146,49 @@ impl Push {
             validate_only: self.validate_only,
             extend: self.extend,
             drop_other_features: self.drop_other_features,
+            keypoints,
             ..pb::RoomUpload::default()
-        }
+        })
     }
+}
+
+/// The description of a room's keypoints.
+fn keypoints_upload(
+    stored: &StoredRoom,
+    keypoints: &RoomKeypoints,
+) -> anyhow::Result<pb::KeypointsUpload> {
+    let KeypointsHeader {
+        source,
+        camera,
+        unit_m,
+        epipolar_px,
+        noise,
+    } = keypoints.header();
+
+    // The upload states one camera for the room and its keypoints, and the features by their name.
+    let features = stored.features(&source.feature.name);
+    if features.map(Features::source) != Some(&source.feature) {
+        bail!(
+            "the room's keypoints belong to features '{}', which it does not have; encode it again",
+            source.feature.name
+        );
+    }
+    if stored.room.provenance().camera != Some(camera) {
+        bail!("the room's keypoints were made with another camera; encode it again");
+    }
+
+    Ok(pb::KeypointsUpload {
+        features: source.feature.name,
+        positions: source.positions,
+        reliability: source.reliability,
+        descriptors: source.descriptors,
+        unit_m,
+        epipolar_px,
+        translation_m: noise.translation_m,
+        rotation_rad: noise.rotation_rad,
+        design_effect: noise.design_effect,
+        gap_scale: noise.gap_scale,
+    })
 }
 
 /// The resource name on the server. `renamed` is a plain name, or one with its collection.
@@ -157,7 +206,7 @@ fn target(source: &ResourceName, renamed: Option<&str>) -> anyhow::Result<Resour
 }
 
 /// The messages of a room upload. The protocol does not carry a dataset's frame numbers, held-out
-/// marks or image paths.
+/// marks, image paths or the path of the keypoints' model.
 fn room_messages(
     stored: &StoredRoom,
     upload: pb::RoomUpload,
@@ -171,6 +220,10 @@ fn room_messages(
     let columns: usize = stored.features.iter().map(|set| set.rows().ncols()).sum();
     let at_once = (MESSAGE_BYTES / (128 + 4 * columns)).max(1);
     let frame_count = stored.room.frame_count();
+    let keypoints = match (&upload.keypoints, &stored.keypoints) {
+        (Some(_), Some(keypoints)) => keypoints.to_bytes()?,
+        _ => Vec::new(),
+    };
     let mut digest = Sha256::new();
     let mut messages = vec![Message::Room(upload)];
 
@@ -180,6 +233,9 @@ fn room_messages(
         batch.features.iter().for_each(|rows| digest.update(rows));
         messages.push(Message::Frames(batch));
     }
+    digest.update(&keypoints);
+    let parts = keypoints.chunks(MESSAGE_BYTES);
+    messages.extend(parts.map(|part| Message::Keypoints(part.to_vec())));
     messages.push(Message::End(pb::UploadEnd {
         frame_count: frame_count as u32,
         sha256: digest.finalize().to_vec(),

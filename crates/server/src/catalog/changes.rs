@@ -22,6 +22,8 @@ use seese3_store::{Kind, Published, ResourceName, Store};
 
 /// Unit of upload memory, bytes.
 const PIECE: usize = 1_024;
+/// Maximum length of free-text fields, characters.
+const LONGEST_WORDS: usize = 1_000;
 /// Maximum number of queued or running changes.
 const MOST_WAITING: usize = 64;
 
@@ -256,6 +258,19 @@ pub fn named_whole(field: &str, text: &str, kind: Kind) -> Result<ResourceName, 
     }
 
     Ok(resource)
+}
+
+/// Checks the length of a free-text field.
+///
+/// # Errors
+/// [`Error::Invalid`] if it has more than [`LONGEST_WORDS`] characters.
+pub fn check_length(field: &str, words: &str) -> Result<(), Error> {
+    if words.chars().count() > LONGEST_WORDS {
+        let problem = format!("is longer than {LONGEST_WORDS} characters");
+        return Err(Error::invalid(field, problem));
+    }
+
+    Ok(())
 }
 
 /// Checks that the caller may change a resource. Adapters affect all rooms, so changing them

@@ -4,6 +4,7 @@
 //! | --- | --- |
 //! | `changes` | common steps of all changes: one at a time, reload of the store, stored responses |
 //! | `recent` | stored responses to recent changes, for idempotent retries |
+//! | `keypoints_upload` | the keypoints of an uploaded room |
 //! | `room_upload` | uploads a room, in batches of frames |
 //! | `adapter_upload` | uploads an adapter |
 //! | `frames` | lists the frames of a room, for clients that plan or draw |
@@ -14,6 +15,7 @@ mod adapter_upload;
 mod changes;
 mod defaults;
 mod frames;
+mod keypoints_upload;
 mod recent;
 mod refits;
 mod room_upload;

@@ -1,4 +1,4 @@
-//! Room uploads, in batches of frames.
+//! Room uploads, in batches of frames and parts of the keypoints.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,18 +14,19 @@ use super::super::auth::Principal;
 use super::super::snapshot::Snapshot;
 use super::super::workers::Lane;
 use super::super::{Error, Handlers, convert};
-use super::changes::{check_right, identity, named_whole, on_blocking_thread, revision_to_wire};
+use super::changes::{
+    check_length, check_right, identity, named_whole, on_blocking_thread, revision_to_wire,
+};
+use super::keypoints_upload::ReceivedKeypoints;
 use seese3_client::proto::v1 as pb;
 use seese3_core::features::{FeatureSource, Features, MAX_COLUMNS, UNSPECIFIED};
 use seese3_core::geometry;
 use seese3_core::room::{Frames, Provenance, Room, RoomId, is_plain_name};
 use seese3_data::pose_check::check_room;
-use seese3_store::{Kind, OtherFeatures, Published, ResourceName};
+use seese3_store::{Kind, OtherFeatures, Published, ResourceName, RoomContents, RoomKeypoints};
 
 /// Idle timeout of an upload.
 const SILENCE: Duration = Duration::from_secs(30);
-/// Maximum length of free-text fields, characters.
-const LONGEST_WORDS: usize = 1_000;
 /// A pose on the wire: 16 numbers of 8 bytes.
 const POSE_BYTES: usize = 128;
 
@@ -72,6 +73,8 @@ struct Received {
     frames: Frames,
     /// The feature values of each source, row by row.
     rows: Vec<Vec<f32>>,
+    /// The keypoints, if the upload has any.
+    keypoints: Option<ReceivedKeypoints>,
     worst_rotation_deviation: f64,
     digest: Sha256,
     /// Hash of the columns that the caller's checksum does not cover.
@@ -119,8 +122,8 @@ impl Handlers {
 
         let name = received.name.name.clone();
         let memory = std::mem::take(&mut received.memory);
-        let (room, features) = finished(received, &upload, &end)?;
-        for warning in check_room(&room, None).warnings {
+        let uploaded = finished(received, &upload, &end)?;
+        for warning in check_room(&uploaded.room, None).warnings {
             tracing::warn!(room = name, %warning, "the poses of an uploaded room look wrong");
         }
         let others = if upload.drop_other_features {
@@ -132,7 +135,10 @@ impl Handlers {
         let store = changes.store.clone();
         if upload.validate_only {
             if upload.extend {
-                let check = async move { store.extended_room(&room, &features, others).await };
+                let check = async move {
+                    let UploadedRoom { room, features, .. } = &uploaded;
+                    store.extended_room(room, features, others).await
+                };
                 on_blocking_thread(check).await??;
             }
             return Ok(pb::CreateRoomResponse::default());
@@ -143,9 +149,10 @@ impl Handlers {
             // Uploaded data counts toward the limit until it is stored.
             let _memory = memory;
             let published = if extend {
-                store.extend_room(&room, &features, others).await
+                let UploadedRoom { room, features, .. } = &uploaded;
+                store.extend_room(room, features, others).await
             } else {
-                store.publish_room(&room, &features).await
+                store.publish_contents(uploaded.contents()).await
             };
             Ok(published?)
         };
@@ -182,12 +189,24 @@ impl Handlers {
                         .map_err(|error| error.within("frames"))?;
                     drop(arrived);
                 }
+                Some(Wire::Keypoints(part)) => {
+                    let Some(keypoints) = &mut received.keypoints else {
+                        let problem = "were not stated: room.keypoints is absent";
+                        return Err(Error::invalid("keypoints", problem));
+                    };
+
+                    let bytes = ReceivedKeypoints::bytes_to_reserve(&part);
+                    received.memory.push(changes.upload_memory(bytes)?);
+                    received.digest.update(&part);
+                    keypoints.take(&part);
+                }
                 Some(Wire::End(end)) => return Ok(end),
                 Some(Wire::Room(_)) => {
                     return Err(Error::invalid("room", "may only be sent once"));
                 }
                 None => {
-                    let problem = "one of room, frames and end is required in every message";
+                    let problem =
+                        "one of room, frames, keypoints and end is required in every message";
                     return Err(Error::invalid("message", problem));
                 }
             }
@@ -291,10 +310,7 @@ fn begun(
     check_right(caller, &name)?;
 
     for (field, words) in [("format", &upload.format), ("licence", &upload.licence)] {
-        if words.chars().count() > LONGEST_WORDS {
-            let problem = format!("is longer than {LONGEST_WORDS} characters");
-            return Err(within(Error::invalid(field, problem)));
-        }
+        check_length(field, words).map_err(within)?;
     }
 
     check_extension(upload).map_err(within)?;
@@ -323,6 +339,7 @@ fn begun(
     Ok(Received {
         name,
         rows: vec![Vec::new(); sources.len()],
+        keypoints: ReceivedKeypoints::begun(upload, &sources).map_err(within)?,
         sources,
         encode_for,
         frames: Frames::default(),
@@ -342,6 +359,10 @@ fn check_extension(upload: &pb::RoomUpload) -> Result<(), Error> {
         };
     }
 
+    if upload.keypoints.is_some() {
+        let problem = "must be left out: known frames keep theirs, and added frames have none";
+        return Err(Error::invalid("keypoints", problem));
+    }
     for (field, words) in [("format", &upload.format), ("licence", &upload.licence)] {
         if !words.is_empty() {
             let problem = "must be left out: a room that is extended keeps its own";
@@ -375,11 +396,8 @@ fn source(given: &pb::FeatureSource) -> Result<FeatureSource, Error> {
         return Err(Error::invalid("features.dim", problem));
     }
 
-    let or_unspecified = |field: &str, given: String| {
-        if given.chars().count() > LONGEST_WORDS {
-            let problem = format!("is longer than {LONGEST_WORDS} characters");
-            return Err(Error::invalid(format!("features.{field}"), problem));
-        }
+    let or_unspecified = |field: &str, given: String| -> Result<String, Error> {
+        check_length(field, &given).map_err(|error| error.within("features"))?;
         Ok(match given.as_str() {
             "" => UNSPECIFIED.to_owned(),
             _ => given,
@@ -497,13 +515,29 @@ fn check_count(field: &str, given: usize, expected: usize) -> Result<(), Error> 
     ))
 }
 
-/// Builds the room and its features from a complete upload, after checking frame count and
-/// checksum.
+/// A complete upload.
+struct UploadedRoom {
+    room: Room,
+    features: Vec<Features>,
+    keypoints: Option<RoomKeypoints>,
+}
+
+impl UploadedRoom {
+    fn contents(&self) -> RoomContents<'_> {
+        RoomContents {
+            room: &self.room,
+            features: &self.features,
+            keypoints: self.keypoints.as_ref(),
+        }
+    }
+}
+
+/// Builds a room from a complete upload, after checking frame count and checksum.
 fn finished(
     received: Received,
     upload: &pb::RoomUpload,
     end: &pb::UploadEnd,
-) -> Result<(Room, Vec<Features>), Error> {
+) -> Result<UploadedRoom, Error> {
     let frame_count = received.frames.poses.len();
     if frame_count != end.frame_count as usize {
         let problem = format!("is {}, but {frame_count} frames arrived", end.frame_count);
@@ -511,7 +545,7 @@ fn finished(
     }
     if received.digest.finalize().as_slice() != end.sha256 {
         let problem = "does not match the received bytes: poses, features and images of each \
-                       batch, in this order";
+                       batch, in this order, and the parts of the keypoints";
         return Err(Error::invalid("end.sha256", problem));
     }
 
@@ -541,5 +575,11 @@ fn finished(
         .collect::<Result<_, Error>>()?;
 
     seese3_store::check_features(&room, &features)?;
-    Ok((room, features))
+    let keypoints = received.keypoints;
+    let keypoints = keypoints.map(|keypoints| keypoints.finished(frame_count));
+    Ok(UploadedRoom {
+        room,
+        features,
+        keypoints: keypoints.transpose()?,
+    })
 }

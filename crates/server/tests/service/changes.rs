@@ -20,13 +20,13 @@ use crate::security::{client_with, principal};
 use seese3_testing::world;
 
 /// A server that takes changes.
-async fn start_writable() -> (TestServer, Store) {
+pub async fn start_writable() -> (TestServer, Store) {
     let (folder, store) = filled_store().await;
     let server = start_on(folder, store.clone(), writable()).await;
     (server, store)
 }
 
-fn writable() -> Config {
+pub fn writable() -> Config {
     Config {
         writable: true,
         ..Config::default()
@@ -35,17 +35,19 @@ fn writable() -> Config {
 
 /// An upload as a test alters it before it is sent.
 #[derive(Clone)]
-struct Upload {
-    spec: pb::RoomUpload,
-    batches: Vec<pb::FrameBatch>,
+pub struct Upload {
+    pub spec: pb::RoomUpload,
+    pub batches: Vec<pb::FrameBatch>,
+    /// Parts of the keypoints, sent after the batches.
+    pub keypoints: Vec<Vec<u8>>,
     /// None to send what was uploaded.
-    sha256: Option<Vec<u8>>,
+    pub sha256: Option<Vec<u8>>,
     frame_count: Option<u32>,
 }
 
 impl Upload {
     /// A room and its features, in batches of 100 frames.
-    fn of(name: &str, room: &Room, features: &Features) -> Self {
+    pub fn of(name: &str, room: &Room, features: &Features) -> Self {
         let source = features.source();
         let bytes = |row: usize| -> Vec<u8> {
             let matrix = room.poses()[row].to_homogeneous().transpose();
@@ -79,6 +81,7 @@ impl Upload {
                 ..pb::RoomUpload::default()
             },
             batches,
+            keypoints: Vec::new(),
             sha256: None,
             frame_count: None,
         }
@@ -89,25 +92,32 @@ impl Upload {
         Self::of(name, &room, &features_of("synthetic"))
     }
 
-    fn messages(self) -> Vec<pb::CreateRoomRequest> {
-        use pb::create_room_request::Message;
-
+    /// SHA-256 of what is sent.
+    pub fn digest(&self) -> Vec<u8> {
         let mut digest = Sha256::new();
-        let mut frame_count = 0;
         for batch in &self.batches {
             digest.update(&batch.poses);
             batch.features.iter().for_each(|rows| digest.update(rows));
             batch.images.iter().for_each(|image| digest.update(image));
-            frame_count += batch.poses.len() as u32 / 128;
         }
+        self.keypoints.iter().for_each(|part| digest.update(part));
+        digest.finalize().to_vec()
+    }
 
+    fn messages(self) -> Vec<pb::CreateRoomRequest> {
+        use pb::create_room_request::Message;
+
+        let poses = self.batches.iter().map(|batch| batch.poses.len());
+        let frame_count = poses.sum::<usize>() as u32 / 128;
+        let digest = self.digest();
         let end = pb::UploadEnd {
             frame_count: self.frame_count.unwrap_or(frame_count),
-            sha256: self.sha256.unwrap_or_else(|| digest.finalize().to_vec()),
+            sha256: self.sha256.unwrap_or(digest),
         };
         let batches = self.batches.into_iter().map(Message::Frames);
         std::iter::once(Message::Room(self.spec))
             .chain(batches)
+            .chain(self.keypoints.into_iter().map(Message::Keypoints))
             .chain([Message::End(end)])
             .map(|message| pb::CreateRoomRequest {
                 message: Some(message),
@@ -115,7 +125,7 @@ impl Upload {
             .collect()
     }
 
-    async fn send(self, client: &Client) -> Result<pb::CreateRoomResponse, Error> {
+    pub async fn send(self, client: &Client) -> Result<pb::CreateRoomResponse, Error> {
         client
             .create_room(tokio_stream::iter(self.messages()))
             .await
