@@ -4,12 +4,14 @@ use std::path::PathBuf;
 
 use anyhow::bail;
 use clap::{Args, Subcommand};
+use ndarray::{Array1, Array2};
 use serde_json::json;
 
 use super::output::{check_folder, check_writable, say, write_file};
 use super::store_option::StoreAndJson;
-use seese3_data::datasets::write_numpy;
+use seese3_data::datasets::{BundleContents, KeypointArrays, write_numpy};
 use seese3_data::export::{kitti_trajectory, tum_trajectory};
+use seese3_robot::matched_views::{COMPRESSED, KeypointMap, MappedKeypoints};
 use seese3_store::StoredRoom;
 
 #[derive(Debug, Args)]
@@ -20,7 +22,8 @@ pub struct Export {
 
 #[derive(Debug, Subcommand)]
 enum Format {
-    /// A folder with poses.npy, timestamps.npy, frame_ids.npy, features_NAME.npy and bundle.json
+    /// A folder with poses.npy, timestamps.npy, frame_ids.npy, features_NAME.npy, bundle.json and, if
+    /// the room has keypoints, keypoint_*.npy
     Numpy(From),
     /// A TUM trajectory file, "timestamp tx ty tz qx qy qz qw" per line: seconds, meters,
     /// world_from_camera
@@ -59,7 +62,16 @@ impl Export {
         match self.format {
             Format::Numpy(from) => {
                 let stored = from.load().await?;
-                let files = write_numpy(&from.out, &stored.room, &stored.features)?;
+                let keypoints = stored.keypoints.as_ref();
+                let keypoints = keypoints
+                    .map(|keypoints| keypoint_arrays(&keypoints.map))
+                    .transpose()?;
+                let contents = BundleContents {
+                    room: &stored.room,
+                    features: &stored.features,
+                    keypoints: keypoints.as_ref(),
+                };
+                let files = write_numpy(&from.out, contents)?;
                 for file in &files {
                     say(format_args!("wrote {}", file.display()));
                 }
@@ -114,4 +126,28 @@ impl From {
         say(format_args!("wrote {}", self.out.display()));
         self.common.json.write(&json!({ "files": [&self.out] }))
     }
+}
+
+/// The keypoints of all frames, frame after frame.
+fn keypoint_arrays(map: &KeypointMap) -> anyhow::Result<KeypointArrays> {
+    let frames = || map.frames.iter();
+    let count = frames().map(MappedKeypoints::len).sum();
+    let points = frames().flat_map(|frame| &frame.points);
+    let positions = points.flat_map(|point| [point.x, point.y]).collect();
+    let descriptors = frames().flat_map(|frame| &frame.descriptors).copied();
+
+    Ok(KeypointArrays {
+        counts: frames().map(|frame| frame.len() as i64).collect(),
+        positions: Array2::from_shape_vec((count, 2), positions)?,
+        inverse_depths: column(frames().map(|frame| &frame.inverse_depths)),
+        deviations: column(frames().map(|frame| &frame.deviations)),
+        descriptors: Array2::from_shape_vec((count, COMPRESSED), descriptors.collect())?,
+        basis_mean: map.basis.mean().clone(),
+        basis_axes: map.basis.axes().clone(),
+    })
+}
+
+/// The numbers of all frames, frame after frame.
+fn column<'a>(frames: impl Iterator<Item = &'a Vec<f32>>) -> Array1<f32> {
+    frames.flatten().copied().collect()
 }

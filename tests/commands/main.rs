@@ -10,6 +10,7 @@
 mod basics;
 #[cfg(target_os = "linux")]
 mod disks;
+mod keypoints;
 mod kills;
 mod manners;
 #[cfg(feature = "onnx")]

@@ -4,17 +4,18 @@
 //! ```text
 //! poses.npy (n, 4, 4)   timestamps.npy (n,) ns   frame_ids.npy (n,)   features_NAME.npy (n, d)
 //! sequences.npy (n,)    the recording that each frame is from, if there are several; not exported
+//! keypoint_*.npy        the keypoints of the frames, see [`KeypointArrays`]
 //! bundle.json           the metadata: name, license, images, sequences, split and the sources of
 //!                       the features
 //! ```
 //!
 //! `import numpy` reads the arrays only; `import bundle` also reads `bundle.json`, which restores
-//! an exported room completely.
+//! an exported room completely, except for its keypoints. They are for other programs.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use ndarray::{Array1, Array3, ArrayBase, Data, Dimension};
+use ndarray::{Array1, Array2, Array3, ArrayBase, Data, Dimension};
 use ndarray_npy::{WritableElement, WriteNpyExt};
 use serde::{Deserialize, Serialize};
 
@@ -56,6 +57,38 @@ struct Bundle {
     camera: Option<CameraIntrinsics>,
     /// The source of each `features_NAME.npy`.
     features: Vec<FeatureSource>,
+}
+
+/// What [`write_numpy`] writes.
+#[derive(Debug, Clone, Copy)]
+pub struct BundleContents<'a> {
+    /// The frames.
+    pub room: &'a Room,
+    /// Feature sets, one row per frame.
+    pub features: &'a [Features],
+    /// Keypoints of the frames, if the room has any.
+    pub keypoints: Option<&'a KeypointArrays>,
+}
+
+/// The keypoints of n frames, k in all, frame after frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct KeypointArrays {
+    /// `keypoint_counts.npy`: number of keypoints of each frame, shape (n).
+    pub counts: Array1<i64>,
+    /// `keypoint_positions.npy`: fractions of the image's width and height from its top left corner,
+    /// shape (k, 2).
+    pub positions: Array2<f32>,
+    /// `keypoint_inverse_depths.npy`: 1 / z in the camera frame, per meter, shape (k).
+    pub inverse_depths: Array1<f32>,
+    /// `keypoint_deviations.npy`: relative standard deviations of the inverse depths, shape (k).
+    pub deviations: Array1<f32>,
+    /// `keypoint_descriptors.npy`: compressed descriptors of unit length, times 200, shape (k, 32).
+    pub descriptors: Array2<i8>,
+    /// `keypoint_basis_mean.npy`: compression subtracts it from a descriptor, shape (d).
+    pub basis_mean: Array1<f32>,
+    /// `keypoint_basis_axes.npy`: compression then multiplies by it, and scales to unit length, shape
+    /// (d, 32).
+    pub basis_axes: Array2<f32>,
 }
 
 /// Reads a folder of NumPy files, of which only `poses.npy` is required.
@@ -238,16 +271,17 @@ fn with_sources(
     Ok(features)
 }
 
-/// Writes a room and its features into a folder, which is created if necessary, and returns the
-/// files. `bundle.json` is written last, so a folder without it is not a complete export.
+/// Writes a room with its features and keypoints into a folder, which is created if necessary, and
+/// returns the files. `bundle.json` is written last, so a folder without it is not a complete export.
 ///
 /// # Errors
 /// [`Error::Io`] if a file cannot be written; [`Error::Malformed`] if the folder is not empty.
-pub fn write_numpy(
-    folder: &Path,
-    room: &Room,
-    features: &[Features],
-) -> Result<Vec<PathBuf>, Error> {
+pub fn write_numpy(folder: &Path, contents: BundleContents<'_>) -> Result<Vec<PathBuf>, Error> {
+    let BundleContents {
+        room,
+        features,
+        keypoints,
+    } = contents;
     let io = |cause| Error::Io {
         file: folder.to_owned(),
         cause,
@@ -302,6 +336,9 @@ pub fn write_numpy(
             &set.rows(),
         )?);
     }
+    if let Some(keypoints) = keypoints {
+        files.extend(write_keypoints(folder, keypoints)?);
+    }
 
     let file = folder.join(SAYS);
     let text = serde_json::to_vec_pretty(&described(room, features)).map_err(|error| {
@@ -317,6 +354,28 @@ pub fn write_numpy(
 
     files.push(file);
     Ok(files)
+}
+
+fn write_keypoints(folder: &Path, keypoints: &KeypointArrays) -> Result<[PathBuf; 7], Error> {
+    let KeypointArrays {
+        counts,
+        positions,
+        inverse_depths,
+        deviations,
+        descriptors,
+        basis_mean,
+        basis_axes,
+    } = keypoints;
+
+    Ok([
+        write_array(folder, "keypoint_counts.npy", counts)?,
+        write_array(folder, "keypoint_positions.npy", positions)?,
+        write_array(folder, "keypoint_inverse_depths.npy", inverse_depths)?,
+        write_array(folder, "keypoint_deviations.npy", deviations)?,
+        write_array(folder, "keypoint_descriptors.npy", descriptors)?,
+        write_array(folder, "keypoint_basis_mean.npy", basis_mean)?,
+        write_array(folder, "keypoint_basis_axes.npy", basis_axes)?,
+    ])
 }
 
 /// The content of `bundle.json` for a room.
@@ -380,11 +439,7 @@ fn resolved(folder: &Path, root: &str) -> Result<String, Error> {
         .ok_or_else(|| malformed("images_root is not UTF-8"))
 }
 
-fn checked(
-    source: FeatureSource,
-    rows: ndarray::Array2<f32>,
-    file: &Path,
-) -> Result<Features, Error> {
+fn checked(source: FeatureSource, rows: Array2<f32>, file: &Path) -> Result<Features, Error> {
     Features::new(source, rows).map_err(|error| Error::Malformed {
         file: file.to_owned(),
         problem: error.into(),

@@ -8,8 +8,9 @@ use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera};
 use seese3_core::room::{FrameId, Provenance, Room, RoomId};
 use seese3_core::splits::HoldOut;
 use seese3_data::datasets::{
-    Error, Reader, Recording, SevenScenes, Unusable, read_arkitscenes, read_bundle, read_numpy,
-    read_scannet, read_sens, read_seven_scenes, read_tum, read_twelve_scenes, write_numpy,
+    BundleContents, Error, KeypointArrays, Reader, Recording, SevenScenes, Unusable,
+    read_arkitscenes, read_bundle, read_numpy, read_scannet, read_sens, read_seven_scenes,
+    read_tum, read_twelve_scenes, write_numpy,
 };
 use seese3_testing::{golden, json, near, number};
 use serde_json::Value;
@@ -410,9 +411,60 @@ fn exported(out: &Path) -> (Room, Features) {
 
     let rows = ndarray::Array2::from_shape_fn((6, 2), |(row, column)| (row * 2 + column) as f32);
     let features = Features::new(source, rows).unwrap();
-    write_numpy(out, &room, std::slice::from_ref(&features)).unwrap();
+    let contents = BundleContents {
+        room: &room,
+        features: std::slice::from_ref(&features),
+        keypoints: Some(&keypoints()),
+    };
+    write_numpy(out, contents).unwrap();
 
     (room, features)
+}
+
+/// Keypoints of six frames, three in all.
+fn keypoints() -> KeypointArrays {
+    KeypointArrays {
+        counts: ndarray::arr1(&[1, 0, 2, 0, 0, 0]),
+        positions: ndarray::arr2(&[[0.0, 1.0], [0.25, 0.5], [0.75, 0.125]]),
+        inverse_depths: ndarray::arr1(&[0.5, 2.0, 0.25]),
+        deviations: ndarray::arr1(&[0.01, 0.02, 0.03]),
+        descriptors: ndarray::Array2::from_shape_fn((3, 32), |(row, column)| {
+            (row as i8 - 1) * column as i8
+        }),
+        basis_mean: ndarray::arr1(&[1.5, -2.5]),
+        basis_axes: ndarray::Array2::from_elem((2, 32), 0.5),
+    }
+}
+
+/// Oracle: NumPy's own format, as the `ndarray-npy` crate reads it. A room without keypoints has no such
+/// file.
+#[test]
+fn exported_keypoints_are_arrays_of_numpy() {
+    let out = tempfile::tempdir().unwrap();
+    let (room, _) = exported(out.path());
+    let array = |name: &str| out.path().join(format!("keypoint_{name}.npy"));
+    let floats = |name: &str| seese3_testing::npy::<f32>(&array(name));
+    let sent = keypoints();
+
+    let counts = seese3_testing::npy::<i64>(&array("counts"));
+    assert_eq!(counts, sent.counts.into_dyn());
+    assert_eq!(floats("positions"), sent.positions.into_dyn());
+    assert_eq!(floats("inverse_depths"), sent.inverse_depths.into_dyn());
+    assert_eq!(floats("deviations"), sent.deviations.into_dyn());
+    let descriptors = seese3_testing::npy::<i8>(&array("descriptors"));
+    assert_eq!(descriptors, sent.descriptors.into_dyn());
+    assert_eq!(floats("basis_mean"), sent.basis_mean.into_dyn());
+    assert_eq!(floats("basis_axes"), sent.basis_axes.into_dyn());
+
+    let without = tempfile::tempdir().unwrap();
+    let contents = BundleContents {
+        room: &room,
+        features: &[],
+        keypoints: None,
+    };
+    let files = write_numpy(without.path(), contents).unwrap();
+    let is_keypoints = |file: &PathBuf| file.to_string_lossy().contains("keypoint_");
+    assert!(!files.iter().any(is_keypoints), "{files:?}");
 }
 
 /// Oracle: NumPy's own format, as the `ndarray-npy` crate reads it, and the room that was written.
@@ -469,8 +521,13 @@ fn an_exported_room_comes_back_whole() {
     assert_eq!(plain.features[0].source(), &FeatureSource::imported("f", 2));
     assert!(plain.frames.names.is_empty());
 
+    let again = BundleContents {
+        room: &room,
+        features: &[],
+        keypoints: None,
+    };
     assert!(
-        write_numpy(out.path(), &room, &[]).is_err(),
+        write_numpy(out.path(), again).is_err(),
         "the folder is not empty"
     );
 }
