@@ -59,7 +59,7 @@ from .errors import (
 )
 from .program import Server, run, serve
 from .requests import Gravity, InitialPose, Odometry, Prediction, Question, RigCamera, TrackConfig, Upload
-from .store import Store, StoredAdapter, StoredRoom
+from .store import Store, StoredAdapter, StoredKeypoints, StoredRoom
 from .views import Feature, Latent, View
 
 __version__ = "0.1.0"
@@ -115,6 +115,7 @@ __all__ = [
     "Step",
     "Store",
     "StoredAdapter",
+    "StoredKeypoints",
     "StoredRoom",
     "Tls",
     "Track",

@@ -45,8 +45,41 @@ GOLDEN_ROWS = 8
 GOLDEN_TOLERANCE = 1e-6
 WEIGHTS = ("phi.0.weight", "phi.0.bias", "phi.1.weight", "phi.1.bias", "phi.3.weight", "phi.3.bias", "W.weight")
 SPLITS = ("time", "blocks", "pairs", "whole", "dataset", "fold1", "fold2", "fold3", "fold4", "fold5")
+# The scales of stored keypoints, and the size of a descriptor.
+POSITION_STEPS = 65535
+MOST_INVERSE_DEPTH = 16.0
+DEVIATION_STEPS = 1000
+COMPRESSED = 32
 NUMBER = re.compile("[0-9]{1,18}")
 PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+
+
+@dataclass(frozen=True, eq=False)
+class StoredKeypoints:
+    """The keypoints of a room's n frames, k in all, frame after frame.
+
+    - `counts` (n,): the number of keypoints of each frame.
+    - `positions` (k, 2): fractions of the image's width and height, from its top left corner.
+    - `inverse_depths` (k,): 1 / z in the camera frame, per metre.
+    - `deviations` (k,): relative standard deviations of the inverse depths.
+    - `descriptors` (k, 32): compressed descriptors of unit length, times 200. `mean` (d,) and `axes` (d, 32) compress
+      others: the mean is subtracted, the rest multiplied by the axes and scaled to unit length.
+    """
+
+    counts: npt.NDArray[np.int64]
+    positions: npt.NDArray[np.float32]
+    inverse_depths: npt.NDArray[np.float32]
+    deviations: npt.NDArray[np.float32]
+    descriptors: npt.NDArray[np.int8]
+    mean: npt.NDArray[np.float32]
+    axes: npt.NDArray[np.float32]
+
+    def rows(self, frame: int) -> slice:
+        """The rows of a frame's keypoints: `keypoints.positions[keypoints.rows(7)]` are those of frame 7."""
+        if not 0 <= frame < len(self.counts):
+            raise IndexError(f"frame {frame}: the room has {len(self.counts)}")
+        first = int(self.counts[:frame].sum())
+        return slice(first, first + int(self.counts[frame]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +87,7 @@ class StoredRoom:
     """A room: poses world_from_camera (n, 4, 4), metres, and features (n, d) by the name of their source.
 
     `images` are the paths of image files; those of a `.sens` recording are its path and the place in it.
+    `keypoints` is None if the room has none.
     """
 
     revision: Revision
@@ -64,6 +98,7 @@ class StoredRoom:
     images: list[Path] | None
     timestamps_ns: npt.NDArray[np.int64] | None
     sequences: npt.NDArray[np.int64] | None
+    keypoints: StoredKeypoints | None
     manifest: dict[str, Any] = field(repr=False)
 
     def __len__(self) -> int:
@@ -170,6 +205,7 @@ class Store:
                 images=None if images is None else [root / image for image in images],
                 timestamps_ns=frames.get("timestamps_ns"),
                 sequences=frames.get("sequences"),
+                keypoints=self._keypoints(name, body),
                 manifest=body,
             )
 
@@ -212,8 +248,9 @@ class Store:
         """Publishes a room: poses world_from_camera (n, 4, 4) in metres, and features (n, d) by name or source.
 
         Rotations are projected onto SO(3). The newest revision is kept beside the new one; if it has the same poses,
-        what is not given here (features of other names, times, names, images, licence) is carried over. The poses are
-        not compared with images: `seese3 check room` does that where the room has some.
+        what is not given here (features of other names, times, names, images, licence) is carried over, and so are its
+        keypoints, unless another camera is given, or features of another encoder under the name of theirs. The poses
+        are not compared with images: `seese3 check room` does that where the room has some.
         """
         _check_name("room", name)
         matrices, deviation = _checked_poses(poses)
@@ -265,7 +302,7 @@ class Store:
         elif newest and "camera" in newest["provenance"]:
             provenance["camera"] = newest["provenance"]["camera"]
 
-        return {
+        body = {
             "schema": SCHEMA,
             "room": name,
             "revision": 0,
@@ -277,6 +314,9 @@ class Store:
             "features": [entries[key] for key in sorted(entries)],
             "provenance": provenance,
         }
+        if newest and _are_valid_for(newest.get("keypoints"), body):
+            body["keypoints"] = newest["keypoints"]
+        return body
 
     def write_adapter(
         self,
@@ -439,6 +479,31 @@ class Store:
             raise DamagedError(f"{path} is truncated or altered: it has another checksum than its manifest states")
         return content
 
+    def _keypoints(self, name: str, body: dict[str, Any]) -> StoredKeypoints | None:
+        entry = body.get("keypoints")
+        if entry is None:
+            return None
+        tensors, frame_count = load(self._object("rooms", name, entry["object"])), body["frame_count"]
+        counts, positions = tensors["counts"], tensors["positions"]
+        inverse_depths, deviations = tensors["inverse_depths"], tensors["deviations"]
+        descriptors, mean, axes = tensors["descriptors"], tensors["basis.mean"], tensors["basis.axes"]
+
+        total = int(counts.sum())
+        shapes = ((frame_count,), (total, 2), (total,), (total,), (total, COMPRESSED), (*mean.shape, COMPRESSED))
+        arrays = (counts, positions, inverse_depths, deviations, descriptors, axes)
+        if tuple(array.shape for array in arrays) != shapes or (counts < 0).any():
+            raise DamagedError(f"room {name!r} has keypoints whose tensors contradict each other or its frames")
+        per_metre = MOST_INVERSE_DEPTH / POSITION_STEPS / entry["unit_m"]
+        return StoredKeypoints(
+            counts=counts,
+            positions=(positions / POSITION_STEPS).astype(np.float32),
+            inverse_depths=(np.maximum(inverse_depths, 1) * per_metre).astype(np.float32),
+            deviations=(np.maximum(deviations, 1) / DEVIATION_STEPS).astype(np.float32),
+            descriptors=descriptors,
+            mean=mean,
+            axes=axes,
+        )
+
     def _list(self, name: str, reference: dict[str, Any] | None) -> list[str] | None:
         if reference is None:
             return None
@@ -555,6 +620,15 @@ def _read_manifest(path: Path) -> dict[str, Any]:
 
 def _source(entry: dict[str, Any]) -> FeatureSource:
     return FeatureSource(**{key: entry[key] for key in FeatureSource.__dataclass_fields__ if key in entry})
+
+
+def _are_valid_for(keypoints: dict[str, Any] | None, body: dict[str, Any]) -> bool:
+    """Whether there are keypoints, of the camera of `body`, and not of features that it replaces."""
+    if keypoints is None or keypoints["camera"] != _as_written(body["provenance"].get("camera")):
+        return False
+    feature = _source(keypoints["source"]["feature"])
+    sources = [_source(entry["source"]) for entry in body["features"]]
+    return all(source == feature for source in sources if source.name == feature.name)
 
 
 def _stored_camera(camera: Camera) -> dict[str, Any]:

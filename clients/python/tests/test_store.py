@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import seese3
 from conftest import FEATURES, ROOM
+from safetensors.numpy import save
 
 RANDOM = np.random.default_rng(3)
 
@@ -59,6 +60,115 @@ def test_a_room_that_is_written_is_exported_by_the_program(tmp_path: Path) -> No
     np.testing.assert_array_equal(room.timestamps_ns, times)
     assert store.room("hall", 1).features.keys() == {"mine"}
     seese3.run("store", "verify", "--store", store.folder)
+
+
+def sealed(manifest: Path, body: dict[str, object]) -> None:
+    """Writes a manifest with the checksum of its body."""
+    text = json.dumps(body)
+    sha256 = hashlib.sha256(text.encode()).hexdigest()
+    manifest.write_text(f'{{"sha256": "{sha256}", "body": {text}}}')
+
+
+def room_with_keypoints(store: seese3.Store, tensors: dict[str, np.ndarray]) -> seese3.Camera:
+    """A room "hall" of two frames with the features "a", and these tensors as its keypoints."""
+    camera = seese3.Camera(640, 480, 525.0)
+    store.write_room("hall", poses(2), {"a": np.ones((2, 3))}, camera=camera)
+    content = save(tensors)
+    sha256 = hashlib.sha256(content).hexdigest()
+    file = f"keypoints-{sha256[:16]}.safetensors"
+    (store.folder / "rooms/hall/objects" / file).write_bytes(content)
+
+    manifest = store.folder / "rooms/hall/revisions/000001.json"
+    body = json.loads(manifest.read_text())["body"]
+    outputs = {"positions": "kpt", "reliability": "heat", "descriptors": "fusion", "model_file": ""}
+    body["keypoints"] = {
+        "source": {"feature": body["features"][0]["source"], **outputs},
+        "camera": body["provenance"]["camera"],
+        "unit_m": 2.0,
+        "epipolar_px": 0.5,
+        "noise": {"translation_m": 0.01, "rotation_rad": 0.01, "design_effect": 2.0, "gap_scale": 0.1},
+        "object": {"file": file, "sha256": sha256, "bytes": len(content)},
+    }
+    sealed(manifest, body)
+    return camera
+
+
+KEYPOINTS = {
+    "counts": np.array([1, 2]),
+    "positions": np.array([[0, 65535], [3, 4], [5, 6]], np.uint16),
+    "inverse_depths": np.array([65535, 20, 0], np.uint16),
+    "deviations": np.array([7, 8, 255], np.uint8),
+    "descriptors": np.arange(96, dtype=np.int8).reshape(3, 32),
+    "basis.mean": np.ones(4, np.float32),
+    "basis.axes": np.ones((4, 32), np.float32),
+}
+
+
+def test_keypoints_are_read_by_their_format(tmp_path: Path) -> None:
+    """Oracle: the format, worked by hand, and the program, which checks the same file.
+
+    65535 steps of a position span the image; 65535 / 16 steps of an inverse depth are 1 per unit, 2 m; a step of a
+    deviation is 0.001.
+    """
+    store = seese3.Store(tmp_path)
+    camera = room_with_keypoints(store, KEYPOINTS)
+    seese3.run("store", "verify", "--store", store.folder)
+    keypoints = store.room("hall").keypoints
+    assert keypoints is not None
+    np.testing.assert_array_equal(keypoints.counts, [1, 2])
+    np.testing.assert_allclose(keypoints.positions[0], [0, 1])
+    np.testing.assert_allclose(keypoints.positions[2], [5 / 65535, 6 / 65535], rtol=1e-6)
+    np.testing.assert_allclose(keypoints.inverse_depths, np.array([65535, 20, 1]) * 8 / 65535, rtol=1e-6)
+    np.testing.assert_allclose(keypoints.deviations, [0.007, 0.008, 0.255], rtol=1e-6)
+    np.testing.assert_array_equal(keypoints.descriptors[keypoints.rows(1)], KEYPOINTS["descriptors"][1:])
+    assert (keypoints.rows(0), keypoints.mean.shape, keypoints.axes.shape) == (slice(0, 1), (4,), (4, 32))
+    with pytest.raises(IndexError, match="frame 2"):
+        keypoints.rows(2)
+
+    seese3.run("export", "numpy", "--store", store.folder, "--room", "hall", "--out", tmp_path / "out")
+    for name in ("counts", "positions", "inverse_depths", "deviations", "descriptors"):
+        np.testing.assert_allclose(np.load(tmp_path / f"out/keypoint_{name}.npy"), getattr(keypoints, name), rtol=1e-6)
+
+    # The same frames keep them, as in the program; another camera and another encoder do not.
+    stated = store.room("hall").poses
+    assert store.write_room("hall", stated, {"b": np.ones((2, 5))}).revision == 2
+    assert store.room("hall").keypoints is not None
+    seese3.run("store", "verify", "--store", store.folder)
+    store.write_room("hall", stated, {seese3.FeatureSource("a", 3, encoder="other"): np.ones((2, 3))})
+    assert store.room("hall").keypoints is None
+    store.write_room("lab", stated, {"a": np.ones((2, 3))}, camera=camera)
+    assert store.room("lab").keypoints is None
+
+
+def test_keypoints_of_another_camera_are_dropped(tmp_path: Path) -> None:
+    """Oracle: the definition of an inverse depth, which depends on the focal length."""
+    store = seese3.Store(tmp_path)
+    camera = room_with_keypoints(store, KEYPOINTS)
+    stated = store.room("hall").poses
+    store.write_room("hall", stated, {"a": np.ones((2, 3))}, camera=camera)
+    assert store.room("hall").keypoints is not None
+    store.write_room("hall", stated, {"a": np.ones((2, 3))}, camera=seese3.Camera(640, 480, 500.0))
+    assert store.room("hall").keypoints is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"counts": np.array([1, 3])},
+        {"counts": np.array([4, -1])},
+        {"counts": np.array([3])},
+        {"positions": KEYPOINTS["positions"][:2]},
+        {"inverse_depths": KEYPOINTS["inverse_depths"][:2]},
+        {"deviations": KEYPOINTS["deviations"][:2]},
+        {"descriptors": np.ones((3, 31), np.int8)},
+        {"basis.axes": np.ones((5, 32), np.float32)},
+    ],
+)
+def test_keypoints_that_contradict_each_other_are_damage(tmp_path: Path, change: dict[str, np.ndarray]) -> None:
+    store = seese3.Store(tmp_path)
+    room_with_keypoints(store, {**KEYPOINTS, **change})
+    with pytest.raises(seese3.DamagedError, match="keypoints"):
+        store.room("hall")
 
 
 def test_a_server_serves_what_was_written(tmp_path: Path) -> None:
@@ -226,9 +336,7 @@ def test_a_manifest_names_files_of_its_own_alone(tmp_path: Path) -> None:
         ({"room": "other"}, "another room"),
         ({"features": [{"source": 3}]}, "not valid"),
     ):
-        text = json.dumps({**body, **changes})
-        sha256 = hashlib.sha256(text.encode()).hexdigest()
-        manifest.write_text(f'{{"sha256": "{sha256}", "body": {text}}}')
+        sealed(manifest, {**body, **changes})
         with pytest.raises(seese3.DamagedError, match=problem):
             store.room("hall")
 
