@@ -150,6 +150,9 @@ impl<'a> Mapping<'a> {
             basis,
             parameters,
         };
+        if mapping.has_no_neighbors() {
+            mapping.unit_m = nearest_unit(poses, &parameters).unwrap_or(mapping.unit_m);
+        }
         mapping.find_unit();
         let pairs = epipolar_pairs(poses, keypoints, camera.height(), mapping.unit_m);
         mapping.epipolar_px = pairs.median_px(&camera).unwrap_or(DEFAULT_EPIPOLAR_PX);
@@ -213,6 +216,11 @@ impl<'a> Mapping<'a> {
             self.unit_m,
             &self.parameters,
         )
+    }
+
+    /// Whether no frame has a neighbor.
+    fn has_no_neighbors(&self) -> bool {
+        (0..self.frames.len()).all(|row| self.neighbors(row).is_empty())
     }
 
     /// Sets the unit to the median depth of the keypoints of some frames.
@@ -297,6 +305,25 @@ fn first_unit(poses: &[Pose]) -> f64 {
     } else {
         1.0
     }
+}
+
+/// The unit in which the median distance of a camera to the nearest other one is the ideal baseline,
+/// meters; `None` if all cameras are in one place.
+///
+/// A few frames are farther apart than the largest baseline in their first unit: two frames that are b
+/// apart have a first unit of 0.75 b. In this unit they are neighbors if their depth allows it.
+fn nearest_unit(poses: &[Pose], parameters: &MappingParameters) -> Option<f64> {
+    let nearest: Vec<f64> = poses
+        .iter()
+        .filter_map(|pose| {
+            poses
+                .iter()
+                .map(|other| (other.translation.vector - pose.translation.vector).norm())
+                .filter(|&distance| distance > 0.0)
+                .min_by(f64::total_cmp)
+        })
+        .collect();
+    quantile(&nearest, 0.5).map(|median| median / parameters.ideal_baseline)
 }
 
 /// Matched keypoints of nearby frames. `height` is that of the images, in image widths; `unit_m`

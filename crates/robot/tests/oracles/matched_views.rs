@@ -115,15 +115,10 @@ fn with_half_exchanged(view: &SceneView, scene: &Scene) -> Keypoints {
     )
 }
 
-/// Oracle: the depths of the scene's points in the cameras that see them.
-#[test]
-fn mapped_inverse_depths_are_those_of_the_scene() {
-    let world = World::exact();
-    let map = world.map(&world.poses, world.camera);
-
+/// The depths of all mapped keypoints in the scene. Fails if an inverse depth is another one.
+fn checked_depths(world: &World, map: &KeypointMap) -> Vec<f64> {
     let mut depths = Vec::new();
     for ((mapped, view), pose) in map.frames.iter().zip(&world.views).zip(&world.poses) {
-        assert!(mapped.len() >= 200, "{} keypoints are mapped", mapped.len());
         for (point, &inverse_depth) in mapped.points.iter().zip(&mapped.inverse_depths) {
             let place = view
                 .keypoints
@@ -141,7 +136,19 @@ fn mapped_inverse_depths_are_those_of_the_scene() {
             depths.push(depth);
         }
     }
+    depths
+}
 
+/// Oracle: the depths of the scene's points in the cameras that see them.
+#[test]
+fn mapped_inverse_depths_are_those_of_the_scene() {
+    let world = World::exact();
+    let map = world.map(&world.poses, world.camera);
+    for mapped in &map.frames {
+        assert!(mapped.len() >= 200, "{} keypoints are mapped", mapped.len());
+    }
+
+    let depths = checked_depths(&world, &map);
     let median = seese3_core::statistics::median(&depths);
     near("unit", map.unit_m, median, 0.1 * median);
     assert!(map.epipolar_px < 1e-3, "{} px", map.epipolar_px);
@@ -288,10 +295,13 @@ fn a_map_without_a_baseline_has_no_depths() {
 /// of its poses; depths from such baselines must not place a view somewhere else.
 #[test]
 fn a_turning_camera_with_noisy_positions_gives_no_wrong_pose() {
-    for jitter_m in [1e-9, 1e-6, 1e-3, 5e-3] {
+    for (count, jitter_m) in [1e-9, 1e-6, 1e-3, 5e-3]
+        .into_iter()
+        .flat_map(|jitter_m| [2, 5, 30].map(|count| (count, jitter_m)))
+    {
         let mut random = Random::new(9);
         let turn = |at: i32| Vector3::y() * (0.01 * f64::from(at) - 0.15);
-        let turning = (0..30).map(|at| Pose::new(Vector3::zeros(), turn(at)));
+        let turning = (0..count).map(|at| Pose::new(Vector3::zeros(), turn(at)));
         let world = World::new(Scene::in_box(POINTS, 1), turning.collect(), 0.3);
         let mut stated = world.poses.clone();
         for pose in &mut stated {
@@ -306,22 +316,75 @@ fn a_turning_camera_with_noisy_positions_gives_no_wrong_pose() {
                 let deviation = found.pose.position_deviation_m();
                 assert!(
                     error < 4.0 * deviation,
-                    "{jitter_m}, {shift_m}: {error} m, deviation {deviation} m"
+                    "{count}, {jitter_m}, {shift_m}: {error} m, deviation {deviation} m"
                 );
             }
         }
     }
 }
 
-/// Oracle: the definition. Two frames do not tell how deep the scene is in baselines, so none is
-/// triangulated, and a view is refused.
+/// `count` cameras in a row along x, `spacing_m` apart.
+fn row_of_poses(count: usize, spacing_m: f64) -> Vec<Pose> {
+    let pose = |at| Pose::new(Vector3::x() * (spacing_m * at as f64), Vector3::zeros());
+    (0..count).map(pose).collect()
+}
+
+/// Oracle: the depths of the scene's points, and the true pose of the view. Few frames are farther
+/// apart than half of the unit that their spread suggests, but not than half of the median depth, 4 m.
 #[test]
-fn a_map_of_two_frames_refuses_views() {
-    let second = Pose::new(Vector3::x() * 0.4, Vector3::zeros());
-    let poses = vec![Pose::identity(), second];
-    let world = World::new(Scene::in_box(POINTS, 1), poses, 0.0);
+fn a_map_of_few_frames_has_the_depths_of_the_scene() {
+    for count in 2..=5 {
+        for spacing_m in [0.2, 0.4, 0.8] {
+            let poses = row_of_poses(count, spacing_m);
+            let world = World::new(Scene::in_box(POINTS, 1), poses, 0.0);
+            let map = world.map(&world.poses, world.camera);
+            let depths = checked_depths(&world, &map);
+            assert!(depths.len() >= 100 * count, "{count}, {spacing_m}");
+
+            let room = world.room_of(&world.poses, map);
+            let moved = Pose::new(Vector3::x() * (0.4 * spacing_m), Vector3::y() * 0.02);
+            let found = result_of(&world, &room, &moved).unwrap();
+            let error = PoseError::between(&moved, &found.pose.pose);
+            assert!(
+                error.translation_m < 1e-3 && error.rotation_rad < 1e-3,
+                "{count}, {spacing_m}: {error:?}"
+            );
+        }
+    }
+}
+
+/// Oracle: the true poses of the views. The noise of a map of two frames is not measured, so that its
+/// covariance is that of a typical map.
+#[test]
+fn a_noisy_map_of_two_frames_gives_no_confident_wrong_pose() {
+    for spacing_m in [0.2, 0.4, 0.8] {
+        let world = World::new(Scene::in_box(POINTS, 1), row_of_poses(2, spacing_m), 0.5);
+        let room = world.room();
+        let mut random = Random::new(6);
+        let mut answered = 0;
+        for _ in 0..20 {
+            let pose = Pose::new(random.normals() * 0.1, random.normals() * 0.05);
+            let view = world.scene.view(&pose, &world.camera, 0.5, &mut random);
+            if let Ok(found) = located(&room, &view.keypoints, &world.camera) {
+                let length = squared_length(&found, &pose).sqrt();
+                assert!(length < 6.0, "{spacing_m}: {length} standard deviations");
+                answered += 1;
+            }
+        }
+        assert!(answered > 0, "{spacing_m}");
+    }
+}
+
+/// Oracle: the definition of the largest baseline, half of the median depth. The points are 2 to 6 m
+/// deep, the cameras 3.2 m apart.
+#[test]
+fn a_map_of_two_frames_too_far_apart_refuses_views() {
+    let world = World::new(Scene::in_box(POINTS, 1), row_of_poses(2, 3.2), 0.0);
+    let map = world.map(&world.poses, world.camera);
+    assert!(map.frames.iter().all(|frame| frame.is_empty()));
+    let room = world.room_of(&world.poses, map);
     let moved = Pose::new(Vector3::x() * 0.1, Vector3::y() * 0.02);
-    assert_not_in_map(result_of(&world, &world.room(), &moved));
+    assert_not_in_map(result_of(&world, &room, &moved));
 }
 
 /// Oracle: the true poses of the views. Three points of a plane determine a pose as any other.
