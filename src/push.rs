@@ -184,10 +184,10 @@ fn keypoints_upload(
         descriptors: source.descriptors,
         unit_m,
         epipolar_px,
-        translation_m: noise.translation_m,
-        rotation_rad: noise.rotation_rad,
         design_effect: noise.design_effect,
         gap_scale: noise.gap_scale,
+        pose_noise: noise.pose_noise,
+        pose_drift: noise.pose_drift,
     })
 }
 

@@ -68,19 +68,19 @@ impl KeypointsHeader {
     /// [`HeaderError`] for the first number that is not above 0, or too large.
     pub fn check(&self) -> Result<(), HeaderError> {
         let MapNoise {
-            translation_m,
-            rotation_rad,
             design_effect,
             gap_scale,
+            pose_noise,
+            pose_drift,
         } = self.noise;
 
         let numbers = [
             ("unit_m", self.unit_m),
             ("epipolar_px", self.epipolar_px),
-            ("translation_m", translation_m),
-            ("rotation_rad", rotation_rad),
             ("design_effect", design_effect),
             ("gap_scale", gap_scale),
+            ("pose_noise", pose_noise),
+            ("pose_drift", pose_drift),
         ];
         let is_wrong = |(_, value): &(_, f64)| !(LARGEST.recip()..=LARGEST).contains(value);
         match numbers.into_iter().find(is_wrong) {

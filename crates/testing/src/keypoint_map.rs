@@ -39,10 +39,10 @@ pub fn keypoint_map(camera: CameraIntrinsics, frame_count: usize, count: usize) 
         unit_m: UNIT_M,
         epipolar_px: 0.7,
         noise: MapNoise {
-            translation_m: 0.003,
-            rotation_rad: 0.001,
             design_effect: 12.0,
             gap_scale: 0.3,
+            pose_noise: 0.001,
+            pose_drift: 0.003,
         },
         basis: DescriptorBasis::from_parts(mean, axes).unwrap(),
         frames,

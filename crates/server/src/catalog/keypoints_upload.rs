@@ -43,10 +43,10 @@ impl ReceivedKeypoints {
             unit_m: stated.unit_m,
             epipolar_px: stated.epipolar_px,
             noise: MapNoise {
-                translation_m: stated.translation_m,
-                rotation_rad: stated.rotation_rad,
                 design_effect: stated.design_effect,
                 gap_scale: stated.gap_scale,
+                pose_noise: stated.pose_noise,
+                pose_drift: stated.pose_drift,
             },
         };
         header

@@ -50,8 +50,8 @@ fn upload(name: &str) -> Upload {
         descriptors: "fusion".to_owned(),
         unit_m: 2.5,
         epipolar_px: 0.7,
-        translation_m: 0.003,
-        rotation_rad: 0.001,
+        pose_noise: 0.001,
+        pose_drift: 0.003,
         design_effect: 12.0,
         gap_scale: 0.3,
     });
@@ -189,13 +189,10 @@ async fn unfit_keypoints_are_refused_and_leave_nothing() {
             |u| stated(u).epipolar_px = f64::NAN,
             "room.keypoints.epipolar_px",
         ),
+        (|u| stated(u).pose_noise = -0.1, "room.keypoints.pose_noise"),
         (
-            |u| stated(u).translation_m = -0.1,
-            "room.keypoints.translation_m",
-        ),
-        (
-            |u| stated(u).rotation_rad = f64::INFINITY,
-            "room.keypoints.rotation_rad",
+            |u| stated(u).pose_drift = f64::INFINITY,
+            "room.keypoints.pose_drift",
         ),
         (
             |u| stated(u).design_effect = 1e300,
