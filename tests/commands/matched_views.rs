@@ -85,6 +85,19 @@ fn a_view_is_located_by_its_keypoints_without_an_adapter() {
         .find(|file| file.ends_with("5.png") || file.ends_with("5.jpg"));
     let other = other.expect("the studio kept no image 5");
 
+    // A room whose keypoints are lost, and an adapter whose encoder the server does not have.
+    here.succeeds("import 7scenes kitchen --name damaged --camera 640x480,525 --store store");
+    here.succeeds(
+        "encode --store store --room damaged --model model.onnx --recipe xfeat-keypoints",
+    );
+    let objects = walk(&here.file("store/rooms/damaged"));
+    let lost = objects.iter().find(|file| file.contains("keypoints"));
+    fs::remove_file(lost.expect("no file of keypoints")).unwrap();
+    here.succeeds("encode --store store --room kitchen --model builtin");
+    here.succeeds(
+        "train --store store --room kitchen --features builtin --split whole --stride 4 --epochs 1 --name blind",
+    );
+
     let server = here.serve("--encoder model.onnx");
     let to = format!("--server {}", server.address);
     let ask = format!("localize {to} --room kitchen --image view.jpg");
@@ -126,6 +139,12 @@ fn a_view_is_located_by_its_keypoints_without_an_adapter() {
     );
     let placed = here.json("placed.json");
     assert_eq!(placed["rooms"][0]["room"]["name"], "kitchen");
+
+    // The other room cannot be loaded: a search of all rooms goes on without it.
+    let everywhere = format!("localize {to} --camera mapping --image view.jpg");
+    here.prints(&everywhere, &["matched keypoints", "room 'kitchen'"]);
+    let broken = format!("{everywhere} --room damaged");
+    here.refuses(&broken, &["room 'damaged' cannot be served"]);
 
     let strange = format!("localize {to} --room kitchen --camera mapping --image {other}");
     here.prints(

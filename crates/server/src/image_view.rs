@@ -1,6 +1,7 @@
 //! Images of requests whose keypoints are matched with those of rooms.
 
 use std::cell::RefCell;
+use std::cmp::Reverse;
 use std::sync::Arc;
 
 use super::image_encoder::ImageEncoder;
@@ -11,6 +12,7 @@ use seese3_core::cancel::Cancellation;
 use seese3_core::geometry::CameraIntrinsics;
 use seese3_core::image::RgbImage;
 use seese3_core::keypoints::{KeypointSource, Keypoints};
+use seese3_core::room::RoomId;
 use seese3_robot::localization::{LocatedView, NotLocated};
 use seese3_robot::matched_views::ViewKeypoints;
 use seese3_store::StoredAdapter;
@@ -18,13 +20,33 @@ use seese3_store::StoredAdapter;
 /// Largest relative difference between the aspect ratios of an image and its camera.
 const MAX_ASPECT_DIFFERENCE: f64 = 0.01;
 
-/// Where the images of a request and their camera are, for errors.
+/// Request fields of the image and its camera, for error messages.
 #[derive(Clone, Copy)]
 pub struct ViewFields<'a> {
     /// Field of the view.
     pub view: &'a str,
     /// Field of the camera.
     pub camera: &'a str,
+}
+
+/// Which rooms are searched.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Searched {
+    /// Rooms that the request names. One that cannot be loaded is an error.
+    Named,
+    /// All rooms. Those that cannot be loaded are skipped; the log and their health report them.
+    All,
+}
+
+impl Searched {
+    /// All rooms if the request names none.
+    pub fn of(rooms: &[String]) -> Self {
+        if rooms.is_empty() {
+            Self::All
+        } else {
+            Self::Named
+        }
+    }
 }
 
 /// A decoded image and its camera.
@@ -50,15 +72,59 @@ struct Pass {
     feature: Vec<f32>,
 }
 
-/// The match of an image with one room.
-pub struct RoomTried {
-    pub room: Arc<ServedRoom>,
-    pub found: Result<LocatedView, NotLocated>,
+/// The matches of an image with several rooms.
+#[derive(Default)]
+pub struct RoomMatches {
+    /// Rooms in which the view is located, the most inliers first.
+    pub located: Vec<(Arc<ServedRoom>, LocatedView)>,
+    /// The other rooms with the reason, the most similar first.
+    pub unmatched: Vec<(Arc<ServedRoom>, NotLocated)>,
+}
+
+impl RoomMatches {
+    fn of(tried: Vec<(Arc<ServedRoom>, Result<LocatedView, NotLocated>)>) -> Self {
+        let mut matches = Self::default();
+        for (room, found) in tried {
+            match found {
+                Ok(view) => matches.located.push((room, view)),
+                Err(why) => matches.unmatched.push((room, why)),
+            }
+        }
+
+        matches
+            .located
+            .sort_by_key(|(_, view)| Reverse(view.inliers));
+        let novelty = |why: &NotLocated| why.novelty().unwrap_or(f64::INFINITY);
+        matches
+            .unmatched
+            .sort_by(|(_, a), (_, b)| novelty(a).total_cmp(&novelty(b)));
+        matches
+    }
+
+    /// The names of the rooms that were tried.
+    pub fn rooms(&self) -> impl Iterator<Item = &RoomId> {
+        let located = self.located.iter().map(|(room, _)| &room.id);
+        located.chain(self.unmatched.iter().map(|(room, _)| &room.id))
+    }
+
+    /// Why the view is not located in a room, if it was tried there.
+    pub fn why_not_in(&self, room: &RoomId) -> Option<NotLocated> {
+        let mut unmatched = self.unmatched.iter();
+        let (_, why) = unmatched.find(|(tried, _)| tried.id == *room)?;
+        Some(*why)
+    }
+
+    /// The camera that the matches contradict, unless another room locates the view.
+    fn contradicted(&self) -> Option<&NotLocated> {
+        let mut reasons = self.unmatched.iter().map(|(_, why)| why);
+        reasons
+            .find(|why| matches!(why, NotLocated::CameraContradicted { .. }))
+            .filter(|_| self.located.is_empty())
+    }
 }
 
 impl<'a> ImageView<'a> {
-    /// The image of a view, if it is one and if this server can match its keypoints with one of
-    /// these rooms.
+    /// The image of a view. `None` if the view is not an image, or if no room can be matched.
     ///
     /// # Errors
     /// [`Error::Invalid`] if the camera is missing or wrong, or the image cannot be decoded.
@@ -90,6 +156,11 @@ impl<'a> ImageView<'a> {
         })?;
 
         let image = encoder.decoded(&format!("{}.image", fields.view), bytes)?;
+        if let GivenCamera::Stated(camera) = &camera {
+            check_aspect(image.width, image.height, camera)
+                .map_err(|problem| Error::invalid(format!("{}.image", fields.view), problem))?;
+        }
+
         Ok(Some(Self {
             fields,
             snapshot,
@@ -102,35 +173,47 @@ impl<'a> ImageView<'a> {
     /// Matches the image with each room that has keypoints. Blocks while rooms are loaded.
     ///
     /// # Errors
-    /// As [`ImageView::matched_with`]; [`Error::Cancelled`] once `cancel` is set.
+    /// [`Error::Invalid`] on the camera if the matches contradict it, or on the image if it has not
+    /// the aspect ratio of the only room's camera; [`Error::Precondition`] if a named room cannot be
+    /// loaded; [`Error::Cancelled`] once `cancel` is set.
     pub fn matched(
         &self,
         rooms: &[Arc<ServedRoom>],
+        searched: Searched,
         cancel: &Cancellation,
-    ) -> Result<Vec<RoomTried>, Error> {
+    ) -> Result<RoomMatches, Error> {
         let mut tried = Vec::new();
         for room in rooms {
             cancel.check()?;
-            if let Some(found) = self.matched_with(room)? {
-                let room = room.clone();
-                tried.push(RoomTried { room, found });
+            match self.matched_with(room, rooms.len() == 1) {
+                Ok(Some(found)) => tried.push((room.clone(), found)),
+                Ok(None) => {}
+                Err(Error::Precondition(_)) if searched == Searched::All => {}
+                Err(error) => return Err(error),
             }
         }
 
-        Ok(tried)
+        let matches = RoomMatches::of(tried);
+        match matches.contradicted() {
+            Some(why) => {
+                let problem = format!("{why}; state the intrinsics of the camera of this image");
+                Err(Error::invalid(self.fields.camera, problem))
+            }
+            None => Ok(matches),
+        }
     }
 
-    /// Matches the image with a room; `None` if the room has no keypoints, or this server no
-    /// encoder of them.
-    ///
-    /// # Errors
-    /// [`Error::Invalid`] if the image has not the aspect ratio of its camera;
-    /// [`Error::Precondition`] if the room cannot be loaded.
+    /// Matches the image with a room. `None` if the room has no keypoints, this server no encoder for
+    /// them, or, unless it `is_only` one, the mapping camera another aspect ratio than the image.
     fn matched_with(
         &self,
         room: &ServedRoom,
+        is_only: bool,
     ) -> Result<Option<Result<LocatedView, NotLocated>>, Error> {
-        let Some(pass) = self.pass(room)? else {
+        let Some(source) = &room.summary.keypoints else {
+            return Ok(None);
+        };
+        let Some(encoder) = self.snapshot.keypoint_encoder(source) else {
             return Ok(None);
         };
         let loaded = room.load()?;
@@ -142,9 +225,17 @@ impl<'a> ImageView<'a> {
             GivenCamera::Stated(camera) => *camera,
             GivenCamera::Mapping => mapped.room.map().camera,
         };
-        let RgbImage { width, height, .. } = self.image;
-        check_aspect(width, height, &camera)
-            .map_err(|problem| Error::invalid(format!("{}.image", self.fields.view), problem))?;
+        match check_aspect(self.image.width, self.image.height, &camera) {
+            Ok(()) => {}
+            Err(problem) if is_only => {
+                let field = format!("{}.image", self.fields.view);
+                let problem = format!("{problem} (room '{}')", room.id);
+                return Err(Error::invalid(field, problem));
+            }
+            Err(_) => return Ok(None),
+        }
+
+        let pass = self.pass(source, encoder)?;
         Ok(Some(mapped.room.locate(ViewKeypoints {
             keypoints: &pass.keypoints,
             camera: &camera,
@@ -161,36 +252,30 @@ impl<'a> ImageView<'a> {
         Some(pass.feature.clone())
     }
 
-    /// The pass of the encoder of a room's keypoints.
-    fn pass(&self, room: &ServedRoom) -> Result<Option<Arc<Pass>>, Error> {
-        let Some(source) = &room.summary.keypoints else {
-            return Ok(None);
-        };
-        let Some(encoder) = self.snapshot.keypoint_encoder(source) else {
-            return Ok(None);
-        };
-
+    /// The pass of an encoder of keypoints.
+    fn pass(&self, source: &KeypointSource, encoder: &ImageEncoder) -> Result<Arc<Pass>, Error> {
         let known = self.passes.borrow();
         if let Some(pass) = known.iter().find(|pass| pass.source.is_like(source)) {
-            return Ok(Some(pass.clone()));
+            return Ok(pass.clone());
         }
         drop(known);
 
-        let frame = encoder.frame_of(&format!("{}.image", self.fields.view), self.image.clone())?;
+        let field = format!("{}.image", self.fields.view);
+        let frame = encoder.frame_of(&field, self.image.clone())?;
         let pass = Arc::new(Pass {
             source: source.clone(),
             keypoints: frame.keypoints.unwrap_or_default(),
             feature: frame.feature,
         });
         self.passes.borrow_mut().push(pass.clone());
-        Ok(Some(pass))
+        Ok(pass)
     }
 }
 
-/// Checks that an image of this size can be of the camera.
+/// Checks that the aspect ratio of an image is that of its camera.
 ///
 /// # Errors
-/// What is wrong with the image.
+/// A description of the mismatch.
 pub fn check_aspect(width: usize, height: usize, camera: &CameraIntrinsics) -> Result<(), String> {
     let aspect = height as f64 / width as f64;
     if (aspect / camera.height() - 1.0).abs() <= MAX_ASPECT_DIFFERENCE {
@@ -218,13 +303,18 @@ fn given_camera(field: &str, camera: &pb::ViewCamera) -> Result<GivenCamera, Err
     use pb::view_camera::Camera;
 
     match &camera.camera {
-        Some(Camera::Intrinsics(intrinsics)) => {
-            let camera = convert::camera(intrinsics);
-            let intrinsics_field = format!("{field}.intrinsics");
-            Ok(GivenCamera::Stated(
-                camera.map_err(|error| error.named(&intrinsics_field))?,
-            ))
-        }
+        Some(Camera::Intrinsics(intrinsics)) => match convert::camera(intrinsics) {
+            Ok(camera) => Ok(GivenCamera::Stated(camera)),
+            // The field begins with `camera`, as in other requests.
+            Err(Error::Invalid {
+                field: part,
+                problem,
+            }) => {
+                let part = part.strip_prefix("camera").unwrap_or_default();
+                Err(Error::invalid(format!("{field}.intrinsics{part}"), problem))
+            }
+            Err(other) => Err(other),
+        },
         Some(Camera::MappingCamera(true)) => Ok(GivenCamera::Mapping),
         Some(Camera::MappingCamera(false)) => Err(Error::invalid(
             format!("{field}.mapping_camera"),
@@ -234,16 +324,5 @@ fn given_camera(field: &str, camera: &pb::ViewCamera) -> Result<GivenCamera, Err
             field,
             "has no value: state the intrinsics, or mapping_camera",
         )),
-    }
-}
-
-/// The error for a camera that the matches contradict, if they do.
-pub fn contradicted(field: &str, why: Option<&NotLocated>) -> Option<Error> {
-    match why {
-        Some(why @ NotLocated::CameraContradicted { .. }) => Some(Error::invalid(
-            field,
-            format!("{why}; state the intrinsics of the camera of this image"),
-        )),
-        _ => None,
     }
 }

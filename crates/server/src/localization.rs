@@ -1,12 +1,13 @@
 //! LocalizationService: Localize, which estimates the pose of a view and retrieves similar frames.
 //! Relocalize is in `relocalization`.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use tonic::{Request, Response, Status};
 
 use super::convert;
-use super::image_view::{ImageView, RoomTried, ViewFields, contradicted};
+use super::image_view::{ImageView, RoomMatches, Searched, ViewFields};
 use super::snapshot::{ServedNavigator, ServedRoom};
 use super::status::view_error;
 use super::workers::Lane;
@@ -14,12 +15,13 @@ use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::localization_service_server::LocalizationService;
 use seese3_core::cancel::Cancellation;
+use seese3_core::keypoints::KeypointSource;
 use seese3_core::localization::{Place, localize};
 use seese3_core::navigation::{Error as E, Source, Start, StepError};
-use seese3_core::room;
+use seese3_core::room::{self, RoomId};
 use seese3_robot::fitting::RoomReader;
 use seese3_robot::localization::{
-    AdapterLocalizer, LocatedView, Method, NotInRoom, NotLocated, PoseEstimate, RoomLocalizer,
+    AdapterLocalizer, LocatedView, Method, NotInRoom, NotLocated, PoseEstimate,
 };
 use seese3_robot::tracking::{MapQuery, PoseReader, PoseWithCovariance};
 
@@ -79,40 +81,37 @@ fn answer(
         camera: "camera",
     };
     let image = ImageView::of(snapshot, fields, view.as_ref(), camera.as_ref(), &asked)?;
-    let tried = match &image {
-        Some(image) => image.matched(&asked, cancel)?,
-        None => Vec::new(),
+    let matches = match &image {
+        Some(image) => image.matched(&asked, Searched::of(&rooms), cancel)?,
+        None => RoomMatches::default(),
     };
 
-    // Then retrieve similar frames. All rooms share one adapter: the view is embedded once, and
-    // distances are comparable between rooms.
-    let served = match rooms_under(snapshot, &rooms, &adapter) {
-        Err(_) if adapter.is_empty() && image.is_some() => Vec::new(),
-        served => served?,
-    };
-    let retrieved = match served.as_slice() {
-        [] => None,
-        several => {
-            let known = image.as_ref();
-            let known = known.and_then(|image| image.feature_for(&several[0].adapter));
-            let source = match known {
-                Some(feature) => Source::Feature(feature),
-                None => convert::source("view", view, &several[0].adapter, snapshot)?,
-            };
-            Some(Retrieved::of(several, source, k as usize, cancel)?)
+    // Then retrieve similar frames. Without them, keypoints still answer.
+    let retrieved = retrieved(snapshot, &rooms, &adapter, view, image.as_ref());
+    let retrieved = match retrieved.and_then(|source| source.similar_frames(k as usize, cancel)) {
+        Err(Error::Precondition(_) | Error::Invalid { .. })
+            if adapter.is_empty() && matches.rooms().next().is_some() =>
+        {
+            None
         }
+        retrieved => Some(retrieved?),
     };
 
     let mut response = match &retrieved {
         Some(retrieved) => pb::LocalizeResponse {
-            adapter: Some(convert::adapter_revision(&served[0])),
-            places: retrieved.places_to_wire(&served, &thresholds)?,
+            adapter: Some(convert::adapter_revision(&retrieved.served[0])),
+            places: retrieved.places_to_wire(&thresholds)?,
             ..Default::default()
         },
         None => pb::LocalizeResponse::default(),
     };
-    response.room_count = served.len().max(asked.len().min(tried.len())) as u32;
-    fill_pose(&mut response, tried, retrieved.as_ref(), &served)?;
+
+    let served = retrieved.iter().flat_map(|retrieved| &retrieved.served);
+    let searched = served.map(|served| served.navigator.room().id());
+    let searched: BTreeSet<&RoomId> = searched.chain(matches.rooms()).collect();
+    response.room_count = searched.len() as u32;
+
+    fill_pose(&mut response, matches, retrieved.as_ref())?;
     if response.method() != pb::LocalizationMethod::MatchedKeypoints
         && response.reason.is_empty()
         && image.is_none()
@@ -147,20 +146,42 @@ pub(super) fn asked_rooms(
     Ok(asked)
 }
 
+/// A view to compare with rooms under one adapter, so that it is embedded once and distances are
+/// comparable between rooms.
+struct ComparedView {
+    served: Vec<Arc<ServedNavigator>>,
+    source: Source,
+}
+
+/// The view of a request, for the adapter that serves the rooms.
+fn retrieved(
+    snapshot: &Snapshot,
+    rooms: &[String],
+    adapter: &str,
+    view: Option<pb::View>,
+    image: Option<&ImageView<'_>>,
+) -> Result<ComparedView, Error> {
+    let served = rooms_under(snapshot, rooms, adapter)?;
+    let stored = &served[0].adapter;
+
+    let source = match image.and_then(|image| image.feature_for(stored)) {
+        Some(feature) => Source::Feature(feature),
+        None => convert::source("view", view, stored, snapshot)?,
+    };
+    Ok(ComparedView { served, source })
+}
+
 /// A view with its most similar frames.
 struct Retrieved {
+    served: Vec<Arc<ServedNavigator>>,
     source: Source,
     start: Start,
     places: Vec<Place>,
 }
 
-impl Retrieved {
-    fn of(
-        served: &[Arc<ServedNavigator>],
-        source: Source,
-        k: usize,
-        cancel: &Cancellation,
-    ) -> Result<Self, Error> {
+impl ComparedView {
+    fn similar_frames(self, k: usize, cancel: &Cancellation) -> Result<Retrieved, Error> {
+        let Self { served, source } = self;
         if matches!(source, Source::Frame(_)) && served.len() != 1 {
             return Err(Error::invalid(
                 "view.frame_id",
@@ -180,21 +201,27 @@ impl Retrieved {
 
         let navigators = served.iter().map(|served| served.navigator.as_ref());
         let places = localize(navigators, start.latent.view(), k, cancel)?;
-        Ok(Self {
+        Ok(Retrieved {
+            served,
             source,
             start,
             places,
         })
     }
+}
 
+impl Retrieved {
     /// The room of the most similar frame.
-    fn nearest_room<'a>(
-        &self,
-        served: &'a [Arc<ServedNavigator>],
-    ) -> Result<&'a ServedNavigator, Error> {
+    fn nearest_room(&self) -> Result<&ServedNavigator, Error> {
         // At least one frame is retrieved.
         let place = self.places.first().ok_or(Error::Internal)?;
-        navigator_of(served, &place.room)
+        self.navigator_of(&place.room)
+    }
+
+    fn navigator_of(&self, room: &RoomId) -> Result<&ServedNavigator, Error> {
+        let mut served = self.served.iter();
+        let found = served.find(|served| served.navigator.room().id() == room);
+        found.map(AsRef::as_ref).ok_or(Error::Internal)
     }
 
     fn query(&self) -> MapQuery<'_> {
@@ -207,13 +234,9 @@ impl Retrieved {
         }
     }
 
-    fn places_to_wire(
-        &self,
-        served: &[Arc<ServedNavigator>],
-        thresholds: &[f64],
-    ) -> Result<Vec<pb::Place>, Error> {
+    fn places_to_wire(&self, thresholds: &[f64]) -> Result<Vec<pb::Place>, Error> {
         let place = |place: &Place| {
-            let served = navigator_of(served, &place.room)?;
+            let served = self.navigator_of(&place.room)?;
             let room = served.navigator.room();
             Ok(pb::Place {
                 room: Some(convert::room_revision(served)),
@@ -230,45 +253,31 @@ impl Retrieved {
     }
 }
 
-fn navigator_of<'a>(
-    served: &'a [Arc<ServedNavigator>],
-    room: &room::RoomId,
-) -> Result<&'a ServedNavigator, Error> {
-    let mut served = served.iter();
-    let found = served.find(|served| served.navigator.room().id() == room);
-    found.map(AsRef::as_ref).ok_or(Error::Internal)
-}
-
 /// Fills the pose of a response: from matched keypoints, else the recorded pose of a stored frame,
 /// else from similar frames.
 fn fill_pose(
     response: &mut pb::LocalizeResponse,
-    tried: Vec<RoomTried>,
+    mut matches: RoomMatches,
     retrieved: Option<&Retrieved>,
-    served: &[Arc<ServedNavigator>],
 ) -> Result<(), Error> {
-    let (located, unmatched) = best_match(tried);
-    if let Some((room, located)) = located {
+    if !matches.located.is_empty() {
+        let (room, view) = matches.located.swap_remove(0);
         response.room = Some(room_to_wire(&room));
-        LocatedPose::of(Ok(PoseEstimate::matched(located)), room.id.as_str()).fill(response);
+        let estimate = PoseEstimate::choose(Some(Ok(view)), || None);
+        LocatedPose::of(estimate, room.id.as_str()).fill(response);
         return Ok(());
-    }
-    for (_, why) in &unmatched {
-        if let Some(error) = contradicted("camera", Some(why)) {
-            return Err(error);
-        }
     }
 
     let Some(retrieved) = retrieved else {
-        // The rooms were only searched by keypoints, and at least one of them has some.
-        let (room, why) = unmatched.first().ok_or(Error::Internal)?;
+        // Only keypoints were compared, with at least one room.
+        let (room, why) = matches.unmatched.first().ok_or(Error::Internal)?;
         response.room = Some(room_to_wire(room));
-        let nowhere = RoomLocalizer::default().locate_by_similarity(None, Some(*why));
-        LocatedPose::of(nowhere, room.id.as_str()).fill(response);
+        let estimate = PoseEstimate::choose(Some(Err(*why)), || None);
+        LocatedPose::of(estimate, room.id.as_str()).fill(response);
         return Ok(());
     };
 
-    let nearest = retrieved.nearest_room(served)?;
+    let nearest = retrieved.nearest_room()?;
     let room = nearest.navigator.room().id();
     response.room = Some(convert::room_revision(nearest));
     if let (Source::Frame(_), Some(pose)) = (&retrieved.source, &retrieved.start.pose) {
@@ -280,64 +289,39 @@ fn fill_pose(
         return Ok(());
     }
 
-    let why = unmatched.iter().find(|(tried, _)| tried.id == *room);
-    let why = why.map(|(_, why)| *why);
-    let localizer = localizer(nearest);
-    let estimate = localizer.locate_by_similarity(Some(retrieved.query()), why);
+    let query = retrieved.query();
+    let matched = matches.why_not_in(room).map(Err);
+    let estimate = PoseEstimate::choose(matched, || Some(localizer(nearest).estimate(query)));
     let mut located = LocatedPose::of(estimate, room.as_str());
-    located.add_fitted(nearest, retrieved.query().feature)?;
+    located.add_fitted(nearest, query.feature)?;
     located.fill(response);
     Ok(())
 }
 
-/// The room in which the most keypoints agree, and the other rooms with the reason, the most
-/// similar first.
-type BestMatch = (
-    Option<(Arc<ServedRoom>, LocatedView)>,
-    Vec<(Arc<ServedRoom>, NotLocated)>,
-);
-
-pub(super) fn best_match(tried: Vec<RoomTried>) -> BestMatch {
-    let mut best: Option<(Arc<ServedRoom>, LocatedView)> = None;
-    let mut unmatched = Vec::new();
-    for RoomTried { room, found } in tried {
-        match found {
-            Ok(located) => {
-                let most = best.as_ref().map_or(0, |(_, best)| best.inliers);
-                if located.inliers > most {
-                    best = Some((room, located));
-                }
-            }
-            Err(why) => unmatched.push((room, why)),
-        }
-    }
-    unmatched.sort_by(|(_, a), (_, b)| a.novelty().total_cmp(&b.novelty()));
-    (best, unmatched)
-}
-
 /// Why keypoints were not tried with the rooms; empty if none has keypoints.
 fn not_tried(snapshot: &Snapshot, asked: &[Arc<ServedRoom>]) -> String {
-    let sources = asked.iter();
-    let mut sources = sources.filter_map(|room| room.summary.keypoints.as_ref());
-    let Some(source) = sources.next() else {
+    let sources = asked
+        .iter()
+        .filter_map(|room| room.summary.keypoints.as_ref());
+    let sources: Vec<&KeypointSource> = sources.collect();
+    if sources.is_empty() {
         return String::new();
-    };
-    if snapshot.keypoint_encoder(source).is_none() {
+    }
+
+    let has_encoder = |source: &&KeypointSource| snapshot.keypoint_encoder(source).is_some();
+    if !sources.iter().any(has_encoder) {
         return "keypoints were not matched: this server has no encoder of the room's keypoints"
             .to_owned();
     }
     "keypoints were not matched: the view is not an image".to_owned()
 }
 
-/// The localizers of a room under an adapter.
-pub(super) fn localizer(served: &ServedNavigator) -> RoomLocalizer<'_> {
-    RoomLocalizer {
-        keypoints: None,
-        adapter: Some(AdapterLocalizer {
-            navigator: &served.navigator,
-            map: served.map.as_deref(),
-            reader: served.room_reader().map(|reader| reader as &dyn PoseReader),
-        }),
+/// The localizer of a room under an adapter.
+pub(super) fn localizer(served: &ServedNavigator) -> AdapterLocalizer<'_> {
+    AdapterLocalizer {
+        navigator: &served.navigator,
+        map: served.map.as_deref(),
+        reader: served.room_reader().map(|reader| reader as &dyn PoseReader),
     }
 }
 
@@ -378,13 +362,8 @@ impl LocatedPose {
             Err(NotInRoom {
                 novelty, unmatched, ..
             }) => Self {
-                novelty: Some(novelty).filter(|novelty| novelty.is_finite()),
-                reason: match unmatched {
-                    Some(why) => format!("the view is not in the map: {why}"),
-                    None => {
-                        "the view is not in the map: it resembles none of its frames".to_owned()
-                    }
-                },
+                novelty,
+                reason: reason_of(unmatched),
                 ..Self::default()
             },
         }
@@ -411,6 +390,17 @@ impl LocatedPose {
         response.reason = self.reason;
         response.matches = self.matches;
         response.fitted = self.fitted;
+    }
+}
+
+/// Why a view is not located in a room. `unmatched` is why its keypoints do not, if they were tried.
+fn reason_of(unmatched: Option<NotLocated>) -> String {
+    match unmatched {
+        None => "the view is not in the map: it resembles none of its frames".to_owned(),
+        Some(why @ (NotLocated::NoKeypoints | NotLocated::NotInMap { .. })) => {
+            format!("the view is not in the map: {why}")
+        }
+        Some(why) => format!("the view is not located: {why}"),
     }
 }
 

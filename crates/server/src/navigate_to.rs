@@ -14,7 +14,7 @@ use tonic::Status;
 use tracing::Instrument;
 
 use super::convert;
-use super::image_view::{ImageView, ViewFields, contradicted};
+use super::image_view::{ImageView, Searched, ViewFields};
 use super::localization::localizer;
 use super::snapshot::{ServedNavigator, Snapshot};
 use super::status::view_error;
@@ -305,8 +305,7 @@ impl MatchedSource {
     /// Matches the source if it is an image and its camera is given.
     ///
     /// # Errors
-    /// As [`ImageView::of`] and [`ImageView::matched`]; [`Error::Invalid`] on `source_camera` if the
-    /// matches contradict it.
+    /// As [`ImageView::of`] and [`ImageView::matched`].
     fn of(
         snapshot: &Snapshot,
         served: &ServedNavigator,
@@ -327,12 +326,11 @@ impl MatchedSource {
             return Ok(Self::default());
         };
 
-        let tried = image.matched(room, &Cancellation::default())?.pop();
-        let found = tried.map(|tried| tried.found);
-        let unmatched = found.as_ref().and_then(|found| found.as_ref().err());
-        if let Some(error) = contradicted("source_camera", unmatched) {
-            return Err(error);
-        }
+        let mut matches = image.matched(room, Searched::Named, &Cancellation::default())?;
+        let located = matches.located.pop().map(|(_, view)| Ok(view));
+        let unmatched = matches.unmatched.pop().map(|(_, why)| Err(why));
+        let found = located.or(unmatched);
+
         Ok(Self {
             feature: image.feature_for(&served.adapter),
             found,
@@ -359,13 +357,8 @@ fn believed_start(
     match (source, view.pose, tried) {
         (Source::Frame(_), Some(pose), _) => Ok(BelievedStart::recorded(pose)),
         (_, Some(pose), _) => Ok(BelievedStart::given(pose, served.map.as_deref(), query)),
-        (_, None, Some(Ok(located))) => {
-            let seen = BelievedStart::seen(Ok(PoseEstimate::matched(located)));
-            seen.ok_or(Error::Internal)
-        }
         (_, None, tried) => {
-            let why = tried.and_then(Result::err);
-            let estimate = localizer(served).locate_by_similarity(Some(query), why);
+            let estimate = PoseEstimate::choose(tried, || Some(localizer(served).estimate(query)));
             BelievedStart::seen(estimate).ok_or(Error::Internal)
         }
     }
@@ -567,7 +560,10 @@ fn reached() -> (pb::NavigateToOutcome, String) {
 fn start_unknown(why: &StartUnknown) -> String {
     match why {
         StartUnknown::FarFromRoom {
-            out_of_distribution,
+            out_of_distribution: None,
+        } => "the source is not located in the room; send another view, or source_pose".to_owned(),
+        StartUnknown::FarFromRoom {
+            out_of_distribution: Some(out_of_distribution),
         } => format!(
             "the source looks like another place: out_of_distribution is {out_of_distribution:.2}, the \
              limit is 1; send another view, or source_pose"

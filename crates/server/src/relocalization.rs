@@ -1,14 +1,13 @@
 //! LocalizationService.Relocalize: finds a camera's room and its pose there without a prior. Also
 //! selects the rooms and maps for Track.
 
-use std::cmp::Reverse;
 use std::sync::Arc;
 
 use tonic::{Request, Response, Status};
 
 use super::convert;
 use super::embedding::{EmbeddedView, StoredFrames, ViewEmbedder};
-use super::image_view::{ImageView, RoomTried, ViewFields, contradicted};
+use super::image_view::{ImageView, RoomMatches, Searched, ViewFields};
 use super::localization::{self, LocatedPose, asked_rooms, localizer, rooms_under};
 use super::snapshot::{ServedNavigator, ServedRoom, Snapshot};
 use super::workers::Lane;
@@ -16,8 +15,7 @@ use super::{Error, Handlers};
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
 use seese3_core::navigation::RetrievedFrame;
-use seese3_core::room::RoomId;
-use seese3_robot::localization::{LocatedView, NotLocated, PoseEstimate, RoomLocalizer};
+use seese3_robot::localization::{LocatedView, NotLocated, PoseEstimate};
 use seese3_robot::tracking::{
     self, Map, MapQuery, ROOM_RATIO, Relocalization, RoomMatch, relocalize,
 };
@@ -68,7 +66,7 @@ fn answer(
     };
 
     // All rooms are compared; `shown` only limits the number of rooms in the answer.
-    let shown = within("max_rooms", max_rooms, ROOMS)?;
+    let shown = within("max_rooms", max_rooms, ROOMS.min(most))?;
     let top_k = within("top_k", top_k, 1)?;
 
     if views.is_empty() || views.len() > MAX_VIEWS {
@@ -86,16 +84,23 @@ fn answer(
         camera: "camera",
     };
     let image = ImageView::of(snapshot, fields, views.last(), camera.as_ref(), &asked)?;
-    let tried = match &image {
-        Some(image) => image.matched(&asked, cancel)?,
-        None => Vec::new(),
+    let matches = match &image {
+        Some(image) => image.matched(&asked, Searched::of(&rooms), cancel)?,
+        None => RoomMatches::default(),
     };
 
-    let by_latent = match rooms_with_maps(snapshot, &rooms, &adapter) {
-        Err(_) if adapter.is_empty() && image.is_some() => None,
-        served => Some(ByLatent::of(served?, views, top_k, snapshot, cancel)?),
+    // Then compare latents. Without them, keypoints still answer.
+    let compared = rooms_with_maps(snapshot, &rooms, &adapter)
+        .and_then(|served| ByLatent::of(served, views, top_k, snapshot, cancel));
+    let by_latent = match compared {
+        Err(Error::Precondition(_) | Error::Invalid { .. })
+            if adapter.is_empty() && matches.rooms().next().is_some() =>
+        {
+            None
+        }
+        compared => Some(compared?),
     };
-    ranked(tried, by_latent.as_ref(), shown)
+    ranked(&matches, by_latent.as_ref(), shown)
 }
 
 /// Rooms under one adapter, each with its map.
@@ -145,6 +150,14 @@ impl ByLatent {
     }
 }
 
+impl ByLatent {
+    /// The rooms with their navigators, the most similar first.
+    fn rooms(&self) -> impl Iterator<Item = (&RoomMatch, &ServedNavigator)> {
+        let rooms = self.found.rooms.iter();
+        rooms.map(|room| (room, self.served[room.map].as_ref()))
+    }
+}
+
 fn query_of(view: &EmbeddedView) -> MapQuery<'_> {
     MapQuery {
         latent: view.latent.view(),
@@ -155,61 +168,41 @@ fn query_of(view: &EmbeddedView) -> MapQuery<'_> {
 /// Ranks the rooms: first those in which the keypoints of the newest view give a pose, by their
 /// inliers, then the others by the distance of latents.
 fn ranked(
-    tried: Vec<RoomTried>,
+    matches: &RoomMatches,
     by_latent: Option<&ByLatent>,
     shown: usize,
 ) -> Result<pb::RelocalizeResponse, Error> {
-    let was_tried: Vec<RoomId> = tried.iter().map(|tried| tried.room.id.clone()).collect();
-    let mut located: Vec<(Arc<ServedRoom>, LocatedView)> = Vec::new();
-    let mut unmatched = Vec::new();
-    for RoomTried { room, found } in tried {
-        match found {
-            Ok(view) => located.push((room, view)),
-            Err(why) => unmatched.push((room, why)),
-        }
-    }
-    located.sort_by_key(|(_, view)| Reverse(view.inliers));
-    if located.is_empty() {
-        let contradicted = |(_, why): &(_, _)| contradicted("camera", Some(why));
-        if let Some(error) = unmatched.iter().find_map(contradicted) {
-            return Err(error);
-        }
-    }
+    let mut rooms: Vec<pb::RoomMatch> = matches.located.iter().map(located_to_wire).collect();
 
-    let mut rooms: Vec<pb::RoomMatch> = located.iter().map(located_to_wire).collect();
-    if let Some(ByLatent {
-        served,
-        found,
-        newest,
-    }) = by_latent
-    {
-        for room in &found.rooms {
-            let id = served[room.map].navigator.room().id();
-            let why = unmatched.iter().find(|(tried, _)| tried.id == *id);
-            let wire = room_to_wire(room, &served[room.map], newest, why.map(|(_, why)| *why))?;
-            match rooms.iter_mut().find(|known| known.room == wire.room) {
-                Some(known) => {
-                    known.distance = wire.distance;
-                    known.distance_ratio = wire.distance_ratio;
-                    known.frames = wire.frames;
-                }
-                None => rooms.push(wire),
+    for (room, served) in by_latent.iter().flat_map(|compared| compared.rooms()) {
+        let why = matches.why_not_in(served.navigator.room().id());
+        let newest = by_latent.map(|compared| &compared.newest);
+        let wire = room_to_wire(room, served, newest.ok_or(Error::Internal)?, why)?;
+        match rooms.iter_mut().find(|known| known.room == wire.room) {
+            Some(known) => {
+                known.distance = wire.distance;
+                known.distance_ratio = wire.distance_ratio;
+                known.frames = wire.frames;
             }
-        }
-    }
-    unmatched.sort_by(|(_, a), (_, b)| a.novelty().total_cmp(&b.novelty()));
-    for (room, why) in &unmatched {
-        let name = room.id.as_str();
-        let is_known =
-            |known: &pb::RoomMatch| known.room.as_ref().is_some_and(|known| known.name == name);
-        if !rooms.iter().any(is_known) {
-            let nowhere = RoomLocalizer::default().locate_by_similarity(None, Some(*why));
-            let nowhere = LocatedPose::of(nowhere, name);
-            rooms.push(match_to_wire(localization::room_to_wire(room), nowhere));
+            None => rooms.push(wire),
         }
     }
 
-    let verdict = verdict(&located, by_latent, &was_tried);
+    for (room, why) in &matches.unmatched {
+        let revision = localization::room_to_wire(room);
+        if !rooms
+            .iter()
+            .any(|known| known.room.as_ref() == Some(&revision))
+        {
+            let nowhere = PoseEstimate::choose(Some(Err(*why)), || None);
+            rooms.push(match_to_wire(
+                revision,
+                LocatedPose::of(nowhere, room.id.as_str()),
+            ));
+        }
+    }
+
+    let verdict = verdict(matches, by_latent);
     let room_count = rooms.len() as u32;
     rooms.truncate(shown);
     Ok(pb::RelocalizeResponse {
@@ -230,32 +223,39 @@ struct Verdict {
 
 /// Whether the best room is clear. Latents alone are not enough for a room whose keypoints do not
 /// locate the newest view.
-fn verdict(
-    located: &[(Arc<ServedRoom>, LocatedView)],
-    by_latent: Option<&ByLatent>,
-    was_tried: &[RoomId],
-) -> Verdict {
-    let inliers = |place: usize| located.get(place).map(|(_, view)| view.inliers as f64);
-    if let Some(best) = inliers(0) {
-        let margin = inliers(1).map(|second| best / second);
+fn verdict(matches: &RoomMatches, by_latent: Option<&ByLatent>) -> Verdict {
+    if let Some((_, best)) = matches.located.first() {
+        let second = matches.located.get(1);
+        let margin = second.map(|(_, second)| best.inliers as f64 / second.inliers as f64);
         let is_clear = margin.is_none_or(|margin| 1.0 / margin <= ROOM_RATIO);
-        let reason = if is_clear {
-            String::new()
+
+        let reason = if !is_clear {
+            "nearly as many keypoints agree with the second room"
+        } else if !best.pose.tells_a_place() {
+            "the pose is not known to within 0.5 m and 15 degrees"
         } else {
-            "nearly as many keypoints agree with the second room".to_owned()
+            ""
         };
-        return Verdict { margin, reason };
+        return Verdict {
+            margin,
+            reason: reason.to_owned(),
+        };
     }
 
-    let Some(ByLatent { served, found, .. }) = by_latent else {
+    let Some(compared) = by_latent else {
         return Verdict {
             margin: None,
             reason: "too few keypoints agree with any room".to_owned(),
         };
     };
-    let best = found.rooms.first();
-    let best = best.map(|room| served[room.map].navigator.room().id());
-    let reason = if best.is_some_and(|best| was_tried.contains(best)) && found.reason.is_empty() {
+
+    let best = compared.rooms().next();
+    let was_tried = best.is_some_and(|(_, best)| {
+        let best = best.navigator.room().id();
+        matches.rooms().any(|room| room == best)
+    });
+    let found = &compared.found;
+    let reason = if was_tried && found.reason.is_empty() {
         "too few keypoints agree with the most similar room".to_owned()
     } else {
         found.reason.clone()
@@ -418,8 +418,8 @@ pub fn maps(served: &[Arc<ServedNavigator>]) -> Result<Vec<Arc<Map>>, Error> {
 
 /// A room in which keypoints give a pose, as a wire message.
 fn located_to_wire((room, view): &(Arc<ServedRoom>, LocatedView)) -> pb::RoomMatch {
-    let estimate = PoseEstimate::matched(view.clone());
-    let located = LocatedPose::of(Ok(estimate), room.id.as_str());
+    let estimate = PoseEstimate::choose(Some(Ok(view.clone())), || None);
+    let located = LocatedPose::of(estimate, room.id.as_str());
     match_to_wire(localization::room_to_wire(room), located)
 }
 
@@ -452,7 +452,9 @@ fn room_to_wire(
 ) -> Result<pb::RoomMatch, Error> {
     let room = served.navigator.room();
     let query = query_of(newest);
-    let estimate = localizer(served).locate_by_similarity(Some(query), unmatched);
+    let estimate = PoseEstimate::choose(unmatched.map(Err), || {
+        Some(localizer(served).estimate(query))
+    });
     let mut located = LocatedPose::of(estimate, room.id().as_str());
     located.add_fitted(served, query.feature)?;
 

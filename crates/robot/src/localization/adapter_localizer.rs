@@ -23,7 +23,7 @@ pub struct AdapterLocalizer<'a> {
 pub struct AdapterEstimate {
     /// `world_from_camera`.
     pub pose: Pose,
-    /// Covariance of the pose error in its own body frame; `None` for
+    /// Covariance of δ in true = pose · exp(δ), ordered (v, ω), meters and radians; `None` for
     /// [`Method::NearestFrame`].
     pub covariance: Option<Matrix6<f64>>,
     /// How the pose was estimated.

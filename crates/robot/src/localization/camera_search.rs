@@ -1,52 +1,46 @@
-//! Estimates the focal length of an unknown camera from its first views.
+//! Estimates the focal length of an unknown camera from its views.
 
 use nalgebra::Vector2;
 
-use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera};
-use seese3_core::keypoints::Keypoints;
-use seese3_core::statistics::median;
-
 use super::KeypointRoom;
 use crate::matched_views::ViewKeypoints;
+use seese3_core::geometry::{CameraError, CameraIntrinsics, Distortion, PixelCamera};
+use seese3_core::keypoints::Keypoints;
 
 /// Focal lengths that are tried, image widths. Between two of them the fit converges.
-pub const FOCAL_CANDIDATES: [f64; 6] = [0.55, 0.68, 0.84, 1.04, 1.28, 1.58];
+const CANDIDATES: [f64; 6] = [0.55, 0.68, 0.84, 1.04, 1.28, 1.58];
 
-/// The camera of views whose focal length is unknown: square pixels, no distortion, and the
-/// principal point in the center. `height` is that of the images, image widths.
+/// A camera with square pixels, no distortion, and the principal point in the center. `focal` and
+/// `height` are in image widths.
 ///
-/// Each view is matched with every candidate; the one with the most inliers, refined by its
-/// matches, is the view's focal length. The result is the median over the views with enough
-/// inliers; `None` if there is no such view.
-pub fn camera_of_views(
+/// # Errors
+/// As [`CameraIntrinsics::new`].
+pub fn simple_camera(focal: f64, height: f64) -> Result<CameraIntrinsics, CameraError> {
+    CameraIntrinsics::new(PixelCamera {
+        width: 1.0,
+        height,
+        focal: Vector2::new(focal, focal),
+        center: None,
+        distortion: Distortion::None,
+    })
+}
+
+/// The focal length of a view whose camera is unknown, image widths, and the number of keypoints that
+/// agree with it. `height` is that of the image, image widths.
+///
+/// The view is matched at each of six focal lengths. The one with the most inliers is refined by its
+/// matches. `None` if too few keypoints agree with any.
+pub fn focal_of_view(
     room: &KeypointRoom,
-    views: &[Keypoints],
+    keypoints: &Keypoints,
     height: f64,
-) -> Option<CameraIntrinsics> {
-    let camera_of = |focal: f64| {
-        let camera = PixelCamera {
-            width: 1.0,
-            height,
-            focal: Vector2::new(focal, focal),
-            center: None,
-            distortion: Distortion::None,
-        };
-        CameraIntrinsics::new(camera).ok()
-    };
-    let candidates: Vec<CameraIntrinsics> =
-        FOCAL_CANDIDATES.into_iter().filter_map(camera_of).collect();
-
-    let focal = |keypoints: &Keypoints| {
-        let fits = candidates
-            .iter()
-            .filter_map(|camera| room.focal_fit(ViewKeypoints { keypoints, camera }));
-        let (focal, _) = fits.max_by_key(|(_, inliers)| *inliers)?;
-        Some(focal)
-    };
-    let focals: Vec<f64> = views.iter().filter_map(focal).collect();
-    if focals.is_empty() {
-        return None;
-    }
-
-    camera_of(median(&focals))
+) -> Option<(f64, usize)> {
+    let fits = CANDIDATES.into_iter().filter_map(|focal| {
+        let camera = simple_camera(focal, height).ok()?;
+        room.fitted_focal(ViewKeypoints {
+            keypoints,
+            camera: &camera,
+        })
+    });
+    fits.max_by_key(|(_, inliers)| *inliers)
 }

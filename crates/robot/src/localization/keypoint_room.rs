@@ -10,13 +10,13 @@
 use std::sync::Arc;
 
 use crate::matched_views::{
-    Candidates, FocalFit, KeypointMap, MappedKeypoints, MatchedView, MatchingParameters,
-    PlaceIndex, ViewKeypoints,
+    Candidates, KeypointMap, MappedKeypoints, MatchedView, MatchingParameters, PlaceIndex,
+    ViewKeypoints,
 };
 use crate::tracking::PoseWithCovariance;
 use seese3_core::geometry::{CameraIntrinsics, Pose};
 
-/// Largest difference between the logarithms of two focal lengths of one camera.
+/// Maximum log ratio at which two focal lengths count as equal.
 const SAME_LOG_FOCAL: f64 = 0.02;
 
 /// A mapped room in which views are located by their keypoints.
@@ -38,8 +38,8 @@ pub struct LocatedView {
     pub inliers: usize,
     /// Number of the view's keypoints.
     pub keypoints: usize,
-    /// The largest ratio of a gate's limit to the view's value; at most 1. It is 1 for a view with
-    /// the fewest accepted inliers, for example.
+    /// The worst of the acceptance gates: how close the view is to the limit, at most 1. A view with
+    /// the fewest accepted inliers has 1, one with twice as many 0.5.
     pub novelty: f64,
     /// The matches.
     pub matched: MatchedView,
@@ -51,15 +51,19 @@ pub struct LocatedView {
 pub enum NotLocated {
     #[error("the view has no keypoints: it is blank, blurred or covered")]
     NoKeypoints,
-    #[error("only {inliers} of {keypoints} keypoints agree with the map, of {needed} needed")]
+    #[error(
+        "only {inliers} of {keypoints} keypoints agree with the map; at least {needed} are required"
+    )]
     NotInMap {
         inliers: usize,
         keypoints: usize,
         needed: usize,
     },
+    #[error("{inliers} keypoints agree with the map, but they cover too small a part of the image")]
+    Clustered { inliers: usize, novelty: f64 },
     #[error(
-        "{inliers} keypoints agree with the map, but in a small part of the image or too far from it: the pose is \
-         uncertain by {position_m:.2} m and {rotation_deg:.1} degrees"
+        "{inliers} keypoints agree with the map, but the pose is uncertain by {position_m:.2} m and \
+         {rotation_deg:.1} degrees"
     )]
     Uncertain {
         inliers: usize,
@@ -67,30 +71,35 @@ pub enum NotLocated {
         rotation_deg: f64,
         novelty: f64,
     },
+    #[error("{inliers} keypoints agree with the map, but they do not determine a pose")]
+    Undetermined { inliers: usize },
     #[error(
-        "the matches contradict the focal length of the view's camera: with {stated:.3} image widths {inliers} \
-         matches agree, with {fitted:.3} image widths {fitted_inliers}"
+        "the matches contradict the focal length of the view's camera: with {stated:.3} image widths {matches} \
+         matches agree, with {fitted:.3} image widths {fitted_matches}"
     )]
     CameraContradicted {
         /// Image widths.
         stated: f64,
         /// Image widths.
         fitted: f64,
-        inliers: usize,
-        fitted_inliers: usize,
+        matches: usize,
+        fitted_matches: usize,
     },
 }
 
 impl NotLocated {
-    /// The largest ratio of a gate's limit to the view's value; above 1.
-    pub fn novelty(&self) -> f64 {
+    /// How far the view is beyond the limit of the worst gate; above 1. `None` if the gates do not
+    /// measure it.
+    pub fn novelty(&self) -> Option<f64> {
         match *self {
-            Self::NoKeypoints => f64::INFINITY,
             Self::NotInMap {
                 inliers, needed, ..
-            } => needed as f64 / inliers as f64,
-            Self::Uncertain { novelty, .. } => novelty,
-            Self::CameraContradicted { stated, fitted, .. } => 1.0 + (fitted / stated).ln().abs(),
+            } if inliers > 0 => Some(needed as f64 / inliers as f64),
+            Self::Clustered { novelty, .. } | Self::Uncertain { novelty, .. } => Some(novelty),
+            Self::NoKeypoints
+            | Self::NotInMap { .. }
+            | Self::Undetermined { .. }
+            | Self::CameraContradicted { .. } => None,
         }
     }
 }
@@ -113,11 +122,6 @@ impl KeypointRoom {
     /// The keypoints of the room.
     pub fn map(&self) -> &KeypointMap {
         &self.map
-    }
-
-    /// `world_from_camera` of the mapped frames.
-    pub fn poses(&self) -> &[Pose] {
-        &self.poses
     }
 
     /// Approximate memory use, bytes.
@@ -147,18 +151,17 @@ impl KeypointRoom {
         self.locate_among(view, Candidates::Near(predicted))
     }
 
-    /// The focal length that fits a view's matches best, image widths, and the number of matches
+    /// The focal length that fits a view's matches best, image widths, and the number of keypoints
     /// that agree with it; `None` if they are too few.
-    pub(super) fn focal_fit(&self, view: ViewKeypoints<'_>) -> Option<(f64, usize)> {
+    pub(super) fn fitted_focal(&self, view: ViewKeypoints<'_>) -> Option<(f64, usize)> {
         let candidates = Candidates::Similar(&self.places);
         let matched = self
             .map
             .match_view(view, candidates, &self.poses, &self.parameters)?;
-        let FocalFit {
-            factor, inliers, ..
-        } = matched.focal?;
-        let is_enough = inliers >= self.parameters.min_inliers;
-        is_enough.then_some((view.camera.focal().x * factor, inliers))
+        let fit = matched.focal?;
+
+        let is_enough = fit.inliers >= self.parameters.min_inliers;
+        is_enough.then_some((view.camera.focal().x * fit.factor, fit.inliers))
     }
 
     fn locate_among(
@@ -192,9 +195,13 @@ impl KeypointRoom {
         let covariance = matched.information.covariance(&self.map.noise);
         let pose = PoseWithCovariance {
             pose: matched.pose,
-            covariance: covariance.ok_or_else(|| not_in_map(inliers))?,
+            covariance: covariance.ok_or(NotLocated::Undetermined { inliers })?,
         };
+
         let novelty = self.novelty(&matched, &pose);
+        if !matched.is_supported(&self.parameters) {
+            return Err(NotLocated::Clustered { inliers, novelty });
+        }
         if novelty > 1.0 {
             return Err(NotLocated::Uncertain {
                 inliers,
@@ -213,7 +220,7 @@ impl KeypointRoom {
         })
     }
 
-    /// The largest ratio of a gate's limit to the view's value.
+    /// The worst of the acceptance gates, 1 at the limit.
     fn novelty(&self, matched: &MatchedView, pose: &PoseWithCovariance) -> f64 {
         let MatchingParameters {
             min_inliers,
@@ -233,8 +240,8 @@ impl KeypointRoom {
 
     /// Compares the stated focal length of a view with the one that fits its matches best.
     ///
-    /// The fitted focal length varies with errors of the map, above all far from the mapped frames.
-    /// A focal length that differs from that of the mapping camera is therefore refused sooner.
+    /// The fitted focal length varies with errors of the map, most of all far from the mapped frames.
+    /// The gate is therefore wider for the focal length of the mapping camera.
     fn contradicted(&self, matched: &MatchedView, camera: &CameraIntrinsics) -> Option<NotLocated> {
         let MatchingParameters {
             confident_inliers,
@@ -244,20 +251,16 @@ impl KeypointRoom {
             other_focal_gate,
             ..
         } = self.parameters;
-        let FocalFit {
-            factor,
-            inliers,
-            independent_variance,
-        } = matched.focal?;
+        let fit = matched.focal?;
 
-        // Among the matches of a view that is not in the map, some focal length always fits a few.
+        // A view outside the map also gets some inliers at some focal length.
         let enough = if matched.inliers < min_inliers {
             confident_inliers
         } else {
             min_inliers
         };
-        let log_factor = factor.ln().abs();
-        if log_factor < min_log_focal || inliers < enough {
+        let log_factor = fit.factor.ln().abs();
+        if log_factor < min_log_focal || fit.inliers < enough {
             return None;
         }
 
@@ -268,17 +271,17 @@ impl KeypointRoom {
         } else {
             other_focal_gate
         };
-        let variance = independent_variance * matched.information.factor(&self.map.noise);
+
+        let variance = fit.independent_variance * matched.information.factor(&self.map.noise);
         let deviations = log_factor / variance.sqrt();
-        let inlier_ratio = inliers as f64 / matched.matches.len() as f64;
-        let is_contradicted =
-            deviations > gate.max_deviations || inlier_ratio > gate.max_inlier_ratio;
+        let ratio = fit.matches as f64 / matched.matches.len() as f64;
+        let is_contradicted = deviations > gate.max_deviations || ratio > gate.max_match_ratio;
 
         is_contradicted.then_some(NotLocated::CameraContradicted {
             stated,
-            fitted: stated * factor,
-            inliers: matched.matches.len(),
-            fitted_inliers: inliers,
+            fitted: stated * fit.factor,
+            matches: matched.matches.len(),
+            fitted_matches: fit.matches,
         })
     }
 }

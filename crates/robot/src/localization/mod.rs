@@ -3,21 +3,19 @@
 //! - [`KeypointRoom`] matches the keypoints of a view with those of the map.
 //! - [`AdapterLocalizer`] estimates the pose from the most similar mapped frames: by the adapter
 //!   that is fitted to the room, by a blend of several frames, or by the nearest frame.
-//! - [`RoomLocalizer`] chooses between them. Matched keypoints come first. The others answer only
-//!   if the view resembles the room.
+//! - [`PoseEstimate::choose`] chooses between them. Matched keypoints come first. The others answer
+//!   only if the view resembles the room, as far as that is known.
 
 mod adapter_localizer;
 mod camera_search;
 mod keypoint_room;
 
 pub use adapter_localizer::{AdapterEstimate, AdapterLocalizer};
-pub use camera_search::{FOCAL_CANDIDATES, camera_of_views};
+pub use camera_search::{focal_of_view, simple_camera};
 pub use keypoint_room::{KeypointRoom, LocatedView, NotLocated};
 
 use nalgebra::Matrix6;
 
-use crate::matched_views::ViewKeypoints;
-use crate::tracking::MapQuery;
 use seese3_core::geometry::Pose;
 
 /// How a pose was estimated from a view.
@@ -31,24 +29,6 @@ pub enum Method {
     SimilarFrames,
     /// The pose of the most similar mapped frame.
     NearestFrame,
-}
-
-/// The localizers of one room.
-#[derive(Clone, Copy, Default)]
-pub struct RoomLocalizer<'a> {
-    /// The keypoints of the room, if it has any.
-    pub keypoints: Option<&'a KeypointRoom>,
-    /// The room under an adapter, if one serves it.
-    pub adapter: Option<AdapterLocalizer<'a>>,
-}
-
-/// What is known of a view.
-#[derive(Clone, Copy)]
-pub struct ViewToLocate<'a> {
-    /// Its keypoints and camera, if it is an image.
-    pub keypoints: Option<ViewKeypoints<'a>>,
-    /// Its latent and feature under the adapter of [`RoomLocalizer`].
-    pub query: Option<MapQuery<'a>>,
 }
 
 /// Estimated pose of a view.
@@ -70,80 +50,69 @@ pub struct PoseEstimate {
     pub unmatched: Option<NotLocated>,
 }
 
-/// A view that is not in the map, as far as is known.
+/// Result for a view that is not located in a room.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NotInRoom {
-    /// How unlike the view is to the room, relative to the limit; above 1.
-    pub novelty: f64,
+    /// How unlike the view is to the room, relative to the limit, above 1; `None` if unknown.
+    pub novelty: Option<f64>,
     /// Why its keypoints do not locate it, if they were tried.
     pub unmatched: Option<NotLocated>,
-    /// The estimate from the most similar frames, which is not to be trusted.
+    /// The rejected estimate from the most similar frames.
     pub nearest: Option<Box<AdapterEstimate>>,
 }
 
-impl RoomLocalizer<'_> {
-    /// Estimates the pose of a view.
+impl PoseEstimate {
+    /// Chooses the pose of a view in a room: from its matched keypoints, else from the most similar
+    /// mapped frames.
+    ///
+    /// - `matched` is the result of the keypoints, `None` if they were not tried.
+    /// - `similar` gives the estimate from the most similar frames, `None` without an adapter.
+    ///
+    /// Similar frames give a pose if their novelty is at most 1. If it is unknown, they give one only
+    /// if no keypoints were tried.
     ///
     /// # Errors
-    /// [`NotInRoom`] if too few keypoints agree with the map and the view does not resemble the
-    /// mapped frames either.
-    pub fn locate(&self, view: ViewToLocate<'_>) -> Result<PoseEstimate, NotInRoom> {
-        let unmatched = match self.keypoints.zip(view.keypoints) {
-            Some((room, keypoints)) => match room.locate(keypoints) {
-                Ok(located) => return Ok(PoseEstimate::matched(located)),
-                Err(why) => Some(why),
-            },
+    /// [`NotInRoom`] if neither gives a pose, or if the matches contradict the view's camera.
+    pub fn choose(
+        matched: Option<Result<LocatedView, NotLocated>>,
+        similar: impl FnOnce() -> Option<AdapterEstimate>,
+    ) -> Result<Self, NotInRoom> {
+        let unmatched = match matched {
+            Some(Ok(located)) => return Ok(Self::of_keypoints(located)),
+            Some(Err(why)) => Some(why),
             None => None,
-        };
-
-        self.locate_by_similarity(view.query, unmatched)
-    }
-
-    /// Estimates the pose of a view from the most similar mapped frames. `unmatched` is why its
-    /// keypoints do not locate it, if they were tried.
-    ///
-    /// # Errors
-    /// As [`Self::locate`].
-    pub fn locate_by_similarity(
-        &self,
-        query: Option<MapQuery<'_>>,
-        unmatched: Option<NotLocated>,
-    ) -> Result<PoseEstimate, NotInRoom> {
-        let adapter = self.adapter.zip(query);
-        let nearest = adapter.map(|(adapter, query)| adapter.estimate(query));
-        let by_keypoints = unmatched.map(|why| why.novelty());
-        let novelty = match &nearest {
-            Some(estimate) => estimate.novelty.or(by_keypoints),
-            None => Some(by_keypoints.unwrap_or(f64::INFINITY)),
         };
 
         // A wrong camera is the caller's mistake, which a less accurate method must not hide.
         let is_contradicted = matches!(unmatched, Some(NotLocated::CameraContradicted { .. }));
-        match (nearest, novelty) {
-            (Some(estimate), novelty)
-                if novelty.is_none_or(|novelty| novelty <= 1.0) && !is_contradicted =>
-            {
-                Ok(PoseEstimate {
-                    pose: estimate.pose,
-                    covariance: estimate.covariance,
-                    method: estimate.method,
-                    novelty,
-                    located: None,
+        let resembles = |estimate: &AdapterEstimate| match estimate.novelty {
+            Some(novelty) => novelty <= 1.0,
+            None => unmatched.is_none(),
+        };
+
+        match similar() {
+            Some(estimate) if resembles(&estimate) && !is_contradicted => Ok(Self {
+                pose: estimate.pose,
+                covariance: estimate.covariance,
+                method: estimate.method,
+                novelty: estimate.novelty,
+                located: None,
+                unmatched,
+            }),
+            rejected => {
+                let by_frames = rejected.and_then(|estimate| estimate.novelty);
+                let by_keypoints = unmatched.and_then(|why| why.novelty());
+                Err(NotInRoom {
+                    novelty: by_frames.filter(|novelty| *novelty > 1.0).or(by_keypoints),
                     unmatched,
+                    nearest: rejected.map(Box::new),
                 })
             }
-            (nearest, novelty) => Err(NotInRoom {
-                novelty: by_keypoints.or(novelty).unwrap_or(f64::INFINITY),
-                unmatched,
-                nearest: nearest.map(Box::new),
-            }),
         }
     }
-}
 
-impl PoseEstimate {
     /// The estimate of matched keypoints.
-    pub fn matched(located: LocatedView) -> Self {
+    fn of_keypoints(located: LocatedView) -> Self {
         Self {
             pose: located.pose.pose,
             covariance: Some(located.pose.covariance),

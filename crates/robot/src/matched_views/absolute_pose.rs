@@ -2,13 +2,14 @@
 //! robust refinement.
 
 use nalgebra::{
-    Cholesky, Isometry3, Matrix2, Matrix2x3, Matrix2x6, Matrix6, Point3, SMatrix, SVector, Vector2,
-    Vector3, Vector6,
+    Cholesky, Isometry3, Matrix2, Matrix2x3, Matrix2x6, Matrix6, Point3, Vector2, Vector3, Vector6,
 };
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::p3p::p3p;
+#[cfg(doc)]
+use seese3_core::epipolar::PIXEL_IMAGE_WIDTH;
 use seese3_core::geometry::{Pose, Twist, exp};
 use seese3_core::statistics::mean;
 
@@ -22,15 +23,7 @@ const FINAL_STEPS: usize = 8;
 const DEGREES_OF_FREEDOM: f64 = 4.0;
 /// Number of matches after which a hypothesis that is already worse than the best is dropped.
 const BLOCK: usize = 32;
-/// Thresholds of the joint refinement of pose and focal length, step by step, in thresholds of an
-/// inlier. They begin wide, because a wrong focal length leaves errors at the edges of the image.
-const FOCAL_THRESHOLDS: [f64; 10] = [4.0, 4.0, 3.0, 3.0, 2.0, 2.0, 1.5, 1.0, 1.0, 1.0];
-/// Largest change of the logarithm of the focal length in one step.
-const MAX_FOCAL_STEP: f64 = 0.1;
-/// Largest logarithm of a fitted focal length over the stated one. Beyond it, the fit has shrunk the
-/// view to a point.
-const MAX_LOG_FOCAL: f64 = 0.6;
-/// Least variance of a keypoint's position, squared pixels: that of stored positions is not 0.
+/// Minimum variance of a keypoint's position, squared pixels.
 const LEAST_VARIANCE_PX: f64 = 0.01;
 /// Minimum depth of a map point in front of the camera, meters.
 const MIN_DEPTH: f64 = 1e-6;
@@ -57,11 +50,11 @@ pub(super) struct Correspondence {
 /// covariance = H⁻¹ · `design_effect` · (1 + gap / `gap_scale`)
 ///            + (`pose_noise`² + `pose_drift`² · gap) · I
 ///
-/// H is the information of the matches, at the variance of their reprojection errors, if the errors
-/// were independent. They are not: nearby points share errors of their depths, which displace a view
-/// the more the farther it is from the matched frames. The errors of the map's stated poses have an
-/// independent part, and a part that drifts like a random walk, with a variance in proportion to the
-/// gap. I is the identity in units (median depths) and radians.
+/// H is the information matrix of the matches for independent errors, at the measured variance of
+/// their reprojection errors. The errors are correlated: nearby points share depth errors, whose
+/// effect on the pose grows with the gap. Stated poses have independent noise, and a random-walk
+/// drift with a variance proportional to the gap. I is the identity in units (median depths) and
+/// radians.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct MapNoise {
@@ -77,7 +70,7 @@ pub struct MapNoise {
 }
 
 impl MapNoise {
-    /// Noise of a map in which it was not measured.
+    /// Default noise, for maps in which it was not measured.
     pub const TYPICAL: Self = Self {
         design_effect: 5.0,
         gap_scale: 0.05,
@@ -86,10 +79,10 @@ impl MapNoise {
     };
 }
 
-/// Settings of the search.
+/// Settings of the search. Pixels are those of an image that is [`PIXEL_IMAGE_WIDTH`] pixels wide.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Search {
-    /// Pixels per unit length on the plane at depth 1.
+    /// Focal length of the view's camera: pixels per unit length on the plane at depth 1.
     pub focal_px: f64,
     /// Largest reprojection error of an inlier, pixels.
     pub threshold_px: f64,
@@ -97,7 +90,7 @@ pub(super) struct Search {
     pub deviation_px: f64,
     /// Minimum and maximum number of iterations.
     pub iterations: [usize; 2],
-    /// Probability of stopping without an all-inlier sample.
+    /// Accepted probability that no all-inlier sample was drawn.
     pub miss_probability: f64,
     /// Seed of the samples.
     pub seed: u64,
@@ -113,19 +106,8 @@ pub(super) struct Found {
     /// Information matrix (inverse covariance) of δ in true = pose · exp(δ), ordered (v, ω), if
     /// the errors of all matches were independent, at the variance of their reprojection errors.
     pub information: Matrix6<f64>,
-    /// The focal length that fits the matches best, if there is one.
-    pub focal: Option<FocalFit>,
-}
-
-/// The focal length of a view that agrees with the most matches.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FocalFit {
-    /// Fitted focal length divided by the stated one.
-    pub factor: f64,
-    /// Number of matches that agree with the fitted focal length.
-    pub inliers: usize,
-    /// Variance of the logarithm of `factor`, if the errors of all matches were independent.
-    pub independent_variance: f64,
+    /// Variance of a keypoint's position, measured on the inliers, squared pixels.
+    pub variance_px: f64,
 }
 
 /// The pose with the most support; `None` if no sample gives a pose.
@@ -198,7 +180,11 @@ fn sampled(matches: &[Correspondence], rng: &mut impl Rng) -> Option<[Correspond
 
 impl Search {
     /// Squared reprojection error in pixels; infinite behind the camera.
-    fn squared_error(&self, match_: &Correspondence, camera_from_world: &Isometry3<f64>) -> f64 {
+    pub(super) fn squared_error(
+        &self,
+        match_: &Correspondence,
+        camera_from_world: &Isometry3<f64>,
+    ) -> f64 {
         let seen = camera_from_world * Point3::from(match_.world);
         if seen.z < MIN_DEPTH {
             return f64::INFINITY;
@@ -287,87 +273,17 @@ impl Search {
             }
         }
 
-        // The variance of a keypoint's position is measured, not the one assumed above.
+        // The information uses the measured variance of keypoint positions instead of the assumed
+        // one.
         let assumed = self.normal_equations(matches, &inliers, &pose).information;
         let inliers = self.inliers(matches, &pose.inverse());
         let variance_px = self.variance_px(matches, &inliers, &pose);
         let information = assumed * (self.deviation_px.powi(2) / variance_px);
-        let focal = self.focal_fit(matches, &pose, variance_px);
         Some(Found {
             pose,
             inliers,
             information,
-            focal,
-        })
-    }
-
-    /// Refines a pose together with the focal length, and counts the matches that then agree.
-    /// `None` if the fit does not converge.
-    fn focal_fit(
-        &self,
-        matches: &[Correspondence],
-        pose: &Pose,
-        variance_px: f64,
-    ) -> Option<FocalFit> {
-        let mut pose = *pose;
-        let mut log_factor = 0.0_f64;
-        let mut variance = f64::INFINITY;
-        let scaled = |match_: &Correspondence, log_factor: f64| Correspondence {
-            plane: match_.plane * (-log_factor).exp(),
-            ..*match_
-        };
-
-        for threshold_ratio in FOCAL_THRESHOLDS {
-            let threshold = threshold_ratio * self.threshold_px;
-            let mut information = SMatrix::<f64, 7, 7>::zeros();
-            let mut gradient = SVector::<f64, 7>::zeros();
-            for match_ in matches {
-                let match_ = scaled(match_, log_factor);
-                let Some(row) = self.linearized(&match_, &pose) else {
-                    continue;
-                };
-                let squared = row.residual.norm_squared();
-                if squared > threshold * threshold {
-                    continue;
-                }
-
-                // A longer focal length moves the point on the plane at depth 1 to the center.
-                let mut by_step = SMatrix::<f64, 2, 7>::zeros();
-                by_step.fixed_columns_mut::<6>(0).copy_from(&row.by_step);
-                by_step
-                    .column_mut(6)
-                    .copy_from(&(match_.plane * self.focal_px));
-                let weight = 1.0 / (1.0 + squared / (0.5 * threshold).powi(2));
-                information += by_step.transpose() * by_step * weight;
-                gradient += by_step.transpose() * row.residual * weight;
-            }
-
-            let cholesky = Cholesky::new(information)?;
-            // Long steps leave the range in which the projection is nearly linear.
-            let mut step = cholesky.solve(&gradient);
-            step *= (MAX_FOCAL_STEP / step[6].abs()).min(1.0);
-            if !step.iter().all(|x| x.is_finite()) {
-                return None;
-            }
-            let unit = SVector::<f64, 7>::from_fn(|row, _| if row == 6 { 1.0 } else { 0.0 });
-            variance = cholesky.solve(&unit)[6] * variance_px;
-            let by_pose: Vector6<f64> = step.fixed_rows::<6>(0).into();
-            pose *= exp(&Twist::from_vector(&by_pose));
-            log_factor += step[6];
-            if log_factor.abs() > MAX_LOG_FOCAL {
-                return None;
-            }
-        }
-
-        let threshold = self.threshold_px * self.threshold_px;
-        let camera_from_world = pose.inverse();
-        let agrees = |match_: &&Correspondence| {
-            self.squared_error(&scaled(match_, log_factor), &camera_from_world) < threshold
-        };
-        Some(FocalFit {
-            factor: log_factor.exp(),
-            inliers: matches.iter().filter(agrees).count(),
-            independent_variance: variance,
+            variance_px,
         })
     }
 
@@ -412,7 +328,7 @@ impl Search {
     }
 
     /// The residual of a match in pixels, and its derivatives; `None` behind the camera.
-    fn linearized(&self, match_: &Correspondence, pose: &Pose) -> Option<Linearized> {
+    pub(super) fn linearized(&self, match_: &Correspondence, pose: &Pose) -> Option<Linearized> {
         let seen = pose
             .inverse_transform_point(&Point3::from(match_.world))
             .coords;
@@ -440,10 +356,10 @@ impl Search {
 }
 
 /// A residual in pixels and the derivatives of the projection.
-struct Linearized {
-    residual: Vector2<f64>,
+pub(super) struct Linearized {
+    pub residual: Vector2<f64>,
     /// By a step δ of the pose on the right, ordered (v, ω).
-    by_step: Matrix2x6<f64>,
+    pub by_step: Matrix2x6<f64>,
     /// By the point in the camera frame.
     by_point: Matrix2x3<f64>,
 }

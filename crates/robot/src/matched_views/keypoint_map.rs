@@ -100,14 +100,6 @@ pub struct KeypointMap {
     pub frames: Vec<MappedKeypoints>,
 }
 
-impl KeypointMap {
-    /// Distance between two camera poses, in units (median depths) plus radians.
-    pub fn gap(&self, a: &Pose, b: &Pose) -> f64 {
-        let between = a.inv_mul(b);
-        between.translation.vector.norm() / self.unit_m + between.rotation.angle()
-    }
-}
-
 /// Triangulates the keypoints of a room's frames, frame by frame.
 pub struct Mapping<'a> {
     frames: Vec<PosedKeypoints<'a>>,

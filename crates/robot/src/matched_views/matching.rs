@@ -5,8 +5,9 @@ use std::collections::BTreeSet;
 use nalgebra::{Vector2, Vector6};
 use ndarray::Array2;
 
-use super::absolute_pose::{Correspondence, FocalFit, PoseInformation, Search, find_pose};
+use super::absolute_pose::{Correspondence, PoseInformation, Search, find_pose};
 use super::descriptors::{mutual_matches, unpacked};
+use super::focal_fit::{FocalFit, fitted_focal};
 use super::keypoint_map::KeypointMap;
 use super::parameters::MatchingParameters;
 use super::retrieval::PlaceIndex;
@@ -116,12 +117,18 @@ impl KeypointMap {
         }
     }
 
+    /// Distance between two camera poses: meters over the median depth, plus radians.
+    fn distance(&self, a: &Pose, b: &Pose) -> f64 {
+        let between = a.inv_mul(b);
+        between.translation.vector.norm() / self.unit_m + between.rotation.angle()
+    }
+
     /// Rows of the `count` frames nearest to a pose, the nearest first.
     fn nearest_to(&self, pose: &Pose, poses: &[Pose], count: usize) -> Vec<usize> {
         let mut order: Vec<(f64, usize)> = poses
             .iter()
             .enumerate()
-            .map(|(row, mapped)| (self.gap(mapped, pose), row))
+            .map(|(row, mapped)| (self.distance(mapped, pose), row))
             .collect();
         order.sort_by(|a, b| a.0.total_cmp(&b.0));
         order.into_iter().take(count).map(|(_, row)| row).collect()
@@ -134,6 +141,8 @@ struct Query<'a> {
     /// Positions of the keypoints in the image.
     points: &'a [Vector2<f32>],
     plane: Vec<Vector2<f64>>,
+    /// Focal length of the view's camera, pixels.
+    focal_px: f64,
     descriptors: Array2<f32>,
 }
 
@@ -146,6 +155,7 @@ impl<'a> Query<'a> {
             map,
             points: view.keypoints.points(),
             plane,
+            focal_px: pixel_focal(view.camera),
             descriptors: unpacked(&compressed),
         }
     }
@@ -183,7 +193,7 @@ impl<'a> Query<'a> {
         }
 
         let search = Search {
-            focal_px: pixel_focal(&self.map.camera),
+            focal_px: self.focal_px,
             threshold_px: parameters.threshold_px(self.map.epipolar_px),
             deviation_px: parameters.deviation_px,
             iterations: parameters.iterations,
@@ -228,7 +238,7 @@ impl<'a> Query<'a> {
                 gap,
                 unit_m: self.map.unit_m,
             },
-            focal: found.focal,
+            focal: fitted_focal(&search, &correspondences, &found.pose, found.variance_px),
             matches,
         })
     }

@@ -7,6 +7,7 @@
 //!   in the map.
 
 mod absolute_pose;
+mod focal_fit;
 mod descriptors;
 mod keypoint_map;
 mod retrieval;
@@ -16,8 +17,9 @@ mod p3p;
 mod parameters;
 mod triangulation;
 
-pub use absolute_pose::{FocalFit, MapNoise, PoseInformation};
+pub use absolute_pose::{MapNoise, PoseInformation};
 pub use descriptors::{COMPRESSED, DescriptorBasis};
+pub use focal_fit::FocalFit;
 pub use keypoint_map::{KeypointMap, MappedKeypoints, Mapping, epipolar_pairs};
 pub use matching::{Candidates, InlierMatch, MatchedView, ViewKeypoints};
 pub use noise::{Trial, TrialRecording, fitted_noise, squared_length, trials};

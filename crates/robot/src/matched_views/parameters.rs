@@ -98,8 +98,9 @@ pub struct FocalGate {
     /// Largest difference between the logarithms of the fitted and the stated focal length,
     /// standard deviations.
     pub max_deviations: f64,
-    /// Largest ratio of the inliers with the fitted focal length to those with the stated one.
-    pub max_inlier_ratio: f64,
+    /// Largest ratio of the matches that agree with the fitted focal length to those that agree with
+    /// the stated one.
+    pub max_match_ratio: f64,
 }
 
 impl MatchingParameters {
@@ -130,11 +131,11 @@ impl Default for MatchingParameters {
             min_log_focal: 0.05,
             mapping_focal_gate: FocalGate {
                 max_deviations: 4.0,
-                max_inlier_ratio: 1.6,
+                max_match_ratio: 1.6,
             },
             other_focal_gate: FocalGate {
                 max_deviations: 2.5,
-                max_inlier_ratio: 1.15,
+                max_match_ratio: 1.15,
             },
         }
     }

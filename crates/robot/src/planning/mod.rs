@@ -50,8 +50,8 @@ pub enum StartUnknown {
     /// The view is out of distribution: it matches no place of the room.
     FarFromRoom {
         /// Distance of the view from the room's map, divided by the largest accepted distance;
-        /// above 1.
-        out_of_distribution: f64,
+        /// above 1. `None` if it is unknown.
+        out_of_distribution: Option<f64>,
     },
     /// The start covariance is too large for this route and tolerance, for example because several
     /// places look alike.
@@ -72,9 +72,9 @@ pub fn plan(
     bounds: RouteBounds,
     cancel: &Cancellation,
 ) -> Result<Planned, Cancelled> {
-    if let Some(out_of_distribution) = start.beyond_limit() {
+    if start.is_unknown() {
         return Ok(Planned::StartUnknown(StartUnknown::FarFromRoom {
-            out_of_distribution,
+            out_of_distribution: start.out_of_distribution,
         }));
     }
 

@@ -19,6 +19,8 @@ pub struct BelievedStart {
     pub out_of_distribution: Option<f64>,
     /// Whether the pose was estimated from the view, not recorded or given.
     is_seen: bool,
+    /// Whether the view is not located in the room, although its most similar frames have a pose.
+    is_rejected: bool,
 }
 
 impl BelievedStart {
@@ -29,6 +31,7 @@ impl BelievedStart {
             covariance: None,
             out_of_distribution: None,
             is_seen: false,
+            is_rejected: false,
         }
     }
 
@@ -48,6 +51,7 @@ impl BelievedStart {
             covariance: estimate.covariance,
             out_of_distribution: estimate.novelty,
             is_seen: true,
+            is_rejected: false,
         }
     }
 
@@ -60,20 +64,22 @@ impl BelievedStart {
                 covariance: estimate.covariance,
                 out_of_distribution: estimate.novelty,
                 is_seen: true,
+                is_rejected: false,
             }),
             Err(NotInRoom {
                 nearest, novelty, ..
             }) => Some(Self {
-                out_of_distribution: Some(novelty),
+                out_of_distribution: novelty,
+                is_rejected: true,
                 ..Self::of_adapter(*nearest?)
             }),
         }
     }
 
-    /// Out-of-distribution ratio, if it is above 1 and the pose was estimated from the view. Such a
-    /// pose must not be used.
-    pub fn beyond_limit(&self) -> Option<f64> {
-        self.out_of_distribution
-            .filter(|far| *far > 1.0 && self.is_seen)
+    /// Whether the pose was estimated from a view that is not located in the room. Such a pose must
+    /// not be used.
+    pub fn is_unknown(&self) -> bool {
+        let is_far = self.out_of_distribution.is_some_and(|far| far > 1.0);
+        self.is_seen && (self.is_rejected || is_far)
     }
 }

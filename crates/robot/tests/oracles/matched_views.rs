@@ -2,11 +2,13 @@
 
 use std::sync::Arc;
 
-use nalgebra::{Matrix6, Point3, Vector2, Vector3, Vector6};
-use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera, Pose, PoseError, log};
+use nalgebra::{Matrix6, Point3, Vector3, Vector6};
+use seese3_core::geometry::{CameraIntrinsics, Pose, PoseError, log};
 use seese3_core::keypoints::Keypoints;
 use seese3_core::statistics::{Coverage, coverage};
-use seese3_robot::localization::{KeypointRoom, LocatedView, NotLocated, camera_of_views};
+use seese3_robot::localization::{
+    KeypointRoom, LocatedView, NotLocated, focal_of_view, simple_camera,
+};
 use seese3_robot::matched_views::{
     Error, KeypointMap, MapNoise, Mapping, MappingParameters, PoseInformation, Trial,
     TrialRecording, ViewKeypoints, fitted_noise, squared_length as squared_length_of,
@@ -536,27 +538,15 @@ fn the_focal_length_of_an_unknown_camera_is_estimated() {
     let world = World::exact();
     let room = world.room();
     for focal in [0.6, 0.77, 1.0, 1.4] {
-        let camera = CameraIntrinsics::new(PixelCamera {
-            width: 640.0,
-            height: 480.0,
-            focal: Vector2::new(focal, focal) * 640.0,
-            center: None,
-            distortion: Distortion::None,
-        })
-        .unwrap();
-        let views: Vec<Keypoints> = new_poses(5)
-            .iter()
-            .map(|pose| {
-                let mut random = Random::new(8);
-                world.scene.view(pose, &camera, 0.0, &mut random).keypoints
-            })
-            .collect();
-
-        let found = camera_of_views(&room, &views, camera.height()).unwrap();
-        near("focal", found.focal().x / focal, 1.0, 0.01);
+        let camera = simple_camera(focal, 0.75).unwrap();
+        for pose in new_poses(5) {
+            let view = world.scene.view(&pose, &camera, 0.0, &mut Random::new(8));
+            let found = focal_of_view(&room, &view.keypoints, camera.height());
+            near("focal", found.unwrap().0 / focal, 1.0, 0.03);
+        }
     }
-    let blank = [Keypoints::default()];
-    assert!(camera_of_views(&room, &blank, 0.75).is_none());
+
+    assert!(focal_of_view(&room, &Keypoints::default(), 0.75).is_none());
 }
 
 /// A trial with the given information; its error is drawn from Student's t distribution with 5 degrees

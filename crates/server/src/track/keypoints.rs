@@ -7,26 +7,84 @@ use super::super::image_view::check_aspect;
 use super::super::snapshot::ServedNavigator;
 use super::super::{Error, convert};
 use seese3_client::proto::v1 as pb;
-use seese3_core::geometry::CameraIntrinsics;
-use seese3_core::keypoints::Keypoints;
-use seese3_robot::localization::camera_of_views;
+use seese3_core::geometry::{CameraIntrinsics, Pose};
+use seese3_core::keypoints::{KeypointSource, Keypoints};
+use seese3_core::statistics::median;
+use seese3_robot::localization::{
+    KeypointRoom, LocatedView, NotLocated, focal_of_view, simple_camera,
+};
 use seese3_robot::matched_views::ViewKeypoints;
 use seese3_robot::tracking::MatchedPose;
 
-/// Number of views from which an unknown focal length is estimated.
-const VIEWS_OF_UNKNOWN_CAMERA: usize = 5;
-/// Maximum number of views that are tried for an unknown focal length. After it, a later view may
-/// still succeed alone, every so many views.
-const TRY_EVERY: u32 = 5;
+/// Number of first views that are tried for an unknown focal length, and the period of later tries in
+/// views. A try takes some 100 ms for each room.
+const FIRST_TRIES: u32 = 5;
+/// Number of views with a focal length whose median is used.
+const VIEWS_OF_FOCAL: usize = 3;
 
 /// The camera of a stream.
 pub enum StreamCamera {
-    /// Stated by the client, or estimated from the first views.
-    Known(CameraIntrinsics),
+    /// Stated by the client.
+    Stated(CameraIntrinsics),
     /// The camera that mapped the room.
     Mapping,
-    /// To be estimated from these views, the newest last; and the number of views so far.
-    Unknown(Vec<Keypoints>, u32),
+    /// Estimated from the stream's views.
+    Estimated(CameraIntrinsics),
+    /// To be estimated.
+    Unknown(FocalSearch),
+}
+
+/// The search for an unknown focal length.
+#[derive(Default)]
+pub struct FocalSearch {
+    /// Focal lengths of views, image widths.
+    focals: Vec<f64>,
+    /// Number of views so far.
+    views: u32,
+}
+
+/// What the images of a stream are matched with.
+pub struct StreamRooms<'a> {
+    pub served: &'a [Arc<ServedNavigator>],
+    /// The source of the image's keypoints.
+    pub source: &'a KeypointSource,
+    /// The stream's room, an index of `served`; `None` while it is unknown.
+    pub room: Option<usize>,
+    /// The last pose of the camera in that room, `world_from_camera`.
+    pub predicted: Option<Pose>,
+}
+
+/// The match of one image.
+#[derive(Default)]
+pub struct StreamMatch {
+    /// The pose; `None` if no room locates the view.
+    pub pose: Option<MatchedPose>,
+    /// The camera that the matches contradict.
+    pub contradicted: Option<NotLocated>,
+}
+
+impl StreamRooms<'_> {
+    /// The rooms to match, with their indices.
+    fn candidates(&self) -> impl Iterator<Item = (usize, &KeypointRoom)> {
+        let served = self.served.iter().enumerate();
+        served.filter_map(|(place, served)| {
+            let keypoints = served.keypoints.as_ref()?;
+            let is_asked = self.room.is_none_or(|room| room == place);
+            let is_matched = is_asked && keypoints.source.is_like(self.source);
+            is_matched.then_some((place, keypoints.room.as_ref()))
+        })
+    }
+
+    /// Locates a view in a room: near the predicted pose, else anywhere.
+    fn located(
+        &self,
+        room: &KeypointRoom,
+        view: ViewKeypoints<'_>,
+    ) -> Result<LocatedView, NotLocated> {
+        let near = self.predicted.filter(|_| self.room.is_some());
+        let near = near.and_then(|predicted| room.locate_near(view, &predicted).ok());
+        near.map_or_else(|| room.locate(view), Ok)
+    }
 }
 
 impl StreamCamera {
@@ -38,91 +96,109 @@ impl StreamCamera {
         match (&config.camera, config.mapping_camera) {
             (Some(_), true) => Err(Error::invalid(
                 "mapping_camera",
-                "and camera are two cameras; give one of them",
+                "is set together with camera; set only one of them",
             )),
-            (Some(camera), false) => Ok(Self::Known(convert::camera(camera)?)),
+            (Some(camera), false) => Ok(Self::Stated(convert::camera(camera)?)),
             (None, true) => Ok(Self::Mapping),
-            (None, false) => Ok(Self::Unknown(Vec::new(), 0)),
+            (None, false) => Ok(Self::Unknown(FocalSearch::default())),
+        }
+    }
+
+    /// Forgets an estimated camera.
+    pub fn restart(&mut self) {
+        if matches!(self, Self::Estimated(_)) {
+            *self = Self::Unknown(FocalSearch::default());
         }
     }
 
     /// Matches an image with the keypoints of the stream's room or, while that is unknown, of all
-    /// rooms. `None` if no room locates it.
+    /// rooms.
     ///
     /// # Errors
     /// [`Error::Invalid`] on `field` if the image has not the aspect ratio of its camera.
     pub fn matched(
         &mut self,
         field: &str,
-        image: ImageKeypoints,
-        served: &[Arc<ServedNavigator>],
-        room: Option<usize>,
-    ) -> Result<Option<MatchedPose>, Error> {
-        let ImageKeypoints {
-            keypoints,
-            size: [width, height],
-        } = image;
-        let candidates = served.iter().enumerate();
-        let candidates: Vec<(usize, &Arc<ServedNavigator>)> = candidates
-            .filter(|(place, _)| room.is_none_or(|room| room == *place))
-            .collect();
-
-        if let Self::Unknown(views, seen) = self {
-            *seen += 1;
-            views.push(keypoints.clone());
-            if views.len() > VIEWS_OF_UNKNOWN_CAMERA {
-                views.remove(0);
+        image: &ImageKeypoints,
+        rooms: &StreamRooms<'_>,
+    ) -> Result<StreamMatch, Error> {
+        let [width, height] = image.size;
+        if let Self::Unknown(search) = self {
+            match search.after(&image.keypoints, height as f64 / width as f64, rooms) {
+                Some(camera) => *self = Self::Estimated(camera),
+                None => return Ok(StreamMatch::default()),
             }
-
-            // Six focal lengths are tried with each view, which takes some 100 ms a view.
-            if views.len() < VIEWS_OF_UNKNOWN_CAMERA || !seen.is_multiple_of(TRY_EVERY) {
-                return Ok(None);
-            }
-            let aspect = height as f64 / width as f64;
-            let found = candidates.iter().find_map(|(_, served)| {
-                let keypoints = served.keypoints.as_ref()?;
-                camera_of_views(&keypoints.room, views, aspect)
-            });
-            let Some(camera) = found else {
-                return Ok(None);
-            };
-            tracing::info!(
-                focal_px = camera.focal().x * width as f64,
-                width,
-                "focal length of a stream's camera estimated"
-            );
-            *self = Self::Known(camera);
         }
 
-        let mut best: Option<(usize, MatchedPose)> = None;
-        for (place, served) in candidates {
-            let Some(mapped) = &served.keypoints else {
-                continue;
-            };
+        let is_only = rooms.candidates().count() == 1;
+        let mut best: Option<(usize, LocatedView)> = None;
+        let mut contradicted = None;
+        for (place, room) in rooms.candidates() {
             let camera = match self {
-                Self::Known(camera) => *camera,
-                Self::Mapping | Self::Unknown(..) => mapped.room.map().camera,
+                Self::Stated(camera) | Self::Estimated(camera) => *camera,
+                Self::Mapping | Self::Unknown(_) => room.map().camera,
             };
-            check_aspect(width, height, &camera)
-                .map_err(|problem| Error::invalid(field, problem))?;
+            match check_aspect(width, height, &camera) {
+                Ok(()) => {}
+                // Rooms may have been mapped with other cameras.
+                Err(_) if matches!(self, Self::Mapping) && !is_only => continue,
+                Err(problem) => return Err(Error::invalid(field, problem)),
+            }
 
             let view = ViewKeypoints {
-                keypoints: &keypoints,
+                keypoints: &image.keypoints,
                 camera: &camera,
             };
-            let Ok(found) = mapped.room.locate(view) else {
-                continue;
-            };
-            if best.as_ref().is_none_or(|(most, _)| found.inliers > *most) {
-                let pose = MatchedPose {
-                    room: place,
-                    pose: found.pose,
-                    novelty: found.novelty,
-                };
-                best = Some((found.inliers, pose));
+            match rooms.located(room, view) {
+                Ok(found) => {
+                    let most = best.as_ref().map_or(0, |(_, best)| best.inliers);
+                    if found.inliers > most {
+                        best = Some((place, found));
+                    }
+                }
+                Err(why @ NotLocated::CameraContradicted { .. }) => contradicted = Some(why),
+                Err(_) => {}
             }
         }
 
-        Ok(best.map(|(_, pose)| pose))
+        if best.is_none() && contradicted.is_some() {
+            self.restart();
+        }
+        Ok(StreamMatch {
+            contradicted: contradicted.filter(|_| best.is_none()),
+            pose: best.map(|(room, found)| MatchedPose {
+                room,
+                pose: found.pose,
+                novelty: found.novelty,
+            }),
+        })
+    }
+}
+
+impl FocalSearch {
+    /// The camera, once enough views have a focal length. `height` is that of the image, image widths.
+    fn after(
+        &mut self,
+        keypoints: &Keypoints,
+        height: f64,
+        rooms: &StreamRooms<'_>,
+    ) -> Option<CameraIntrinsics> {
+        self.views = self.views.saturating_add(1);
+        if self.views > FIRST_TRIES && !self.views.is_multiple_of(FIRST_TRIES) {
+            return None;
+        }
+
+        let fits = rooms
+            .candidates()
+            .filter_map(|(_, room)| focal_of_view(room, keypoints, height));
+        let (focal, _) = fits.max_by_key(|(_, inliers)| *inliers)?;
+        self.focals.push(focal);
+        if self.focals.len() < VIEWS_OF_FOCAL {
+            return None;
+        }
+
+        let focal = median(&self.focals);
+        tracing::info!(focal, "focal length of a stream's camera, image widths");
+        simple_camera(focal, height).ok()
     }
 }

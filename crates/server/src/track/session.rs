@@ -5,19 +5,21 @@ use std::time::Duration;
 
 use super::super::Error;
 use super::super::convert;
-use super::super::embedding::{EmbeddedView, StoredFrames, ViewEmbedder};
+use super::super::embedding::{EmbeddedView, ImageKeypoints, StoredFrames, ViewEmbedder};
 use super::super::relocalization::maps;
 use super::super::snapshot::{ServedNavigator, Snapshot};
 use super::Overtaken;
 use super::configuration::{StreamFrames, back_pressure, rooms, settings};
-use super::keypoints::StreamCamera;
+use super::keypoints::{StreamCamera, StreamMatch, StreamRooms};
 use super::sealed::Sealed;
 use super::sensors::Sensors;
 use super::token::TokenKey;
 use super::wire;
 use seese3_client::proto::v1 as pb;
+use seese3_core::geometry::Pose;
+use seese3_core::keypoints::KeypointSource;
 use seese3_robot::tracking::{
-    Observation, OtherView, PoseWithCovariance, Refusal, State, Tracker, Update,
+    Observation, OtherView, PoseWithCovariance, Refusal, State, Status, Tracker, Update,
 };
 
 const FIELD: &str = "config";
@@ -34,6 +36,8 @@ pub struct Session {
     frames: StreamFrames,
     sensors: Sensors,
     camera: StreamCamera,
+    /// The last map pose while TRACKING, `world_from_camera`.
+    last_pose: Option<Pose>,
     state: State,
     key: TokenKey,
 }
@@ -188,6 +192,7 @@ impl Session {
             frames,
             sensors,
             camera,
+            last_pose: None,
             state,
             key: key.clone(),
         })
@@ -350,6 +355,8 @@ impl Session {
     /// moved since.
     pub fn reset(&mut self) -> pb::TrackResponse {
         self.state = self.tracker.start(None);
+        self.camera.restart();
+        self.last_pose = None;
         self.answer(pb::track_response::Answer::Acknowledged(
             pb::TrackAcknowledged {},
         ))
@@ -366,18 +373,36 @@ impl Session {
         embedder.embed(field, view)
     }
 
+    /// The source of the keypoints of images: the first of a room that this server can detect.
+    fn keypoint_source(&self) -> Option<&KeypointSource> {
+        let served = self.served.iter();
+        let mut sources = served.filter_map(|served| Some(&served.keypoints.as_ref()?.source));
+        sources.find(|source| self.encoders.keypoint_encoder(source).is_some())
+    }
+
+    /// Matches the keypoints of the stream's own image with its rooms.
+    fn matched(&mut self, image: &ImageKeypoints) -> Result<StreamMatch, Error> {
+        let Some(source) = self.keypoint_source().cloned() else {
+            return Ok(StreamMatch::default());
+        };
+        let rooms = StreamRooms {
+            served: &self.served,
+            source: &source,
+            room: self.state.room,
+            predicted: self.last_pose,
+        };
+        self.camera.matched("frame.view.image", image, &rooms)
+    }
+
     /// Encodes the view of the stream's own camera, with the keypoints of an image if a room has
     /// some and this server can detect them.
     fn encoded_own_view(&self, view: Option<pb::View>) -> Result<EmbeddedView, Error> {
-        let sources = self.served.iter();
-        let sources = sources.filter_map(|served| Some(&served.keypoints.as_ref()?.source));
+        let source = self.keypoint_source();
         let embedder = ViewEmbedder {
             adapter: &self.served[0].adapter,
             snapshot: &self.encoders,
             frames: StoredFrames::Refused,
-            detector: sources
-                .filter_map(|source| self.encoders.keypoint_encoder(source))
-                .next(),
+            detector: source.and_then(|source| self.encoders.keypoint_encoder(source)),
         };
         embedder.embed("frame.view", view)
     }
@@ -445,12 +470,9 @@ impl Session {
             is_blank,
             keypoints,
         } = self.encoded_own_view(view).map_err(refused(Reason::View))?;
-        let matched = match keypoints {
-            Some(image) if !is_blank => self
-                .camera
-                .matched("frame.view.image", image, &self.served, self.state.room)
-                .map_err(refused(Reason::View))?,
-            _ => None,
+        let StreamMatch { pose, contradicted } = match keypoints {
+            Some(image) if !is_blank => self.matched(&image).map_err(refused(Reason::View))?,
+            _ => StreamMatch::default(),
         };
         let other_views = self
             .encoded_other_views(other_views)
@@ -469,7 +491,7 @@ impl Session {
             sequence,
             latent,
             feature,
-            matched,
+            matched: pose,
             is_blank,
             measured,
             gravity,
@@ -477,16 +499,24 @@ impl Session {
         };
 
         // The tracker refuses late and duplicate frames. A refused frame does not change the state.
-        self.tracker
-            .observe(&mut self.state, &observation)
-            .map_err(|refusal| {
-                let reason = match &refusal {
-                    Refusal::Late { .. } => Reason::Late,
-                    Refusal::Duplicate { .. } => Reason::Duplicate,
-                    Refusal::View(_) => Reason::View,
-                };
-                Refused::Frame(reason, refusal.to_string())
-            })
+        let update = self.tracker.observe(&mut self.state, &observation);
+        let mut update = update.map_err(|refusal| {
+            let reason = match &refusal {
+                Refusal::Late { .. } => Reason::Late,
+                Refusal::Duplicate { .. } => Reason::Duplicate,
+                Refusal::View(_) => Reason::View,
+            };
+            Refused::Frame(reason, refusal.to_string())
+        })?;
+
+        let tracked = update
+            .map_pose
+            .filter(|_| update.status == Status::Tracking);
+        self.last_pose = tracked.map(|tracked| tracked.pose);
+        if let Some(why) = contradicted {
+            update.reason = format!("{}; keypoints are not used: {why}", update.reason);
+        }
+        Ok(update)
     }
 
     fn answer(&self, answer: pb::track_response::Answer) -> pb::TrackResponse {
