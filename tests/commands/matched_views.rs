@@ -146,6 +146,8 @@ fn a_view_is_located_by_its_keypoints_without_an_adapter() {
     let broken = format!("{everywhere} --room damaged");
     here.refuses(&broken, &["room 'damaged' cannot be served"]);
 
+    tracks_without_an_adapter(&here, &to);
+
     let strange = format!("localize {to} --room kitchen --camera mapping --image {other}");
     here.prints(
         &format!("{strange} --json strange.json"),
@@ -157,6 +159,47 @@ fn a_view_is_located_by_its_keypoints_without_an_adapter() {
     here.prints(
         &format!("{views} {other}"),
         &["ambiguous", "too few keypoints"],
+    );
+}
+
+/// Oracle: the recorded poses of the frames, none of which is mapped. The adapter of the room is not
+/// calibrated, so keypoints alone track the camera.
+fn tracks_without_an_adapter(here: &Place, to: &str) {
+    let kitchen = shared().join("rooms/kitchen");
+    fs::create_dir(here.file("stream")).unwrap();
+    let frames = ASKED..ASKED + 5;
+    for frame in frames.clone() {
+        let name = format!("{frame:06}.jpg");
+        fs::copy(
+            kitchen.join(kitchen_file(frame, "color.jpg")),
+            here.file("stream").join(name),
+        )
+        .unwrap();
+    }
+
+    let track = format!("track {to} --room kitchen --images stream");
+    here.prints(
+        &format!("{track} --camera mapping --count 3 --save-token token --json first.jsonl"),
+        &["2 of them TRACKING"],
+    );
+    let updates = fs::read_to_string(here.file("first.jsonl")).unwrap();
+    let last: Value = serde_json::from_str(updates.lines().last().unwrap()).unwrap();
+    let position = &last["map_from_camera"]["position"];
+    let [x, y, z] = ["x", "y", "z"].map(|axis| number(&position[axis]));
+    let truth = true_pose(&kitchen.join(kitchen_file(ASKED + 2, "pose.txt")));
+    let error = (nalgebra::Vector3::new(x, y, z) - truth.translation.vector).norm();
+    assert!(error < 0.03, "{error}");
+
+    here.prints(
+        &format!("track {to} --images stream --from 3 --resume token"),
+        &["2 of them TRACKING"],
+    );
+
+    // An image tells more than a feature, and the filter needs one.
+    here.succeeds("export numpy --store store --room kitchen --out exported");
+    here.refuses(
+        &format!("track {to} --room kitchen --feature exported/features_builtin.npy --count 2"),
+        &["frame.view: must be an image"],
     );
 }
 

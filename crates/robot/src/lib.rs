@@ -39,6 +39,7 @@
 //! | --- | --- |
 //! | [`matched_views`] | estimates a view's pose from keypoints matched with mapped keypoints |
 //! | [`tracking`] | tracks a camera frame by frame, with covariances |
+//! | [`pose_filter`] | tracks a camera by located views, without an adapter |
 //! | [`localization`] | estimates where a view is in a mapped room, by the best method that answers |
 //! | [`planning`] | plans a route from a view to a goal, over a room's frames |
 //! | [`calibration`] | measures an adapter's errors in rooms that it was not trained on |
@@ -50,6 +51,7 @@
 
 pub mod matched_views;
 pub mod tracking;
+pub mod pose_filter;
 pub mod localization;
 pub mod two_view;
 pub mod calibration;

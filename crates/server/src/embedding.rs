@@ -55,6 +55,21 @@ pub struct ImageKeypoints {
     pub size: [usize; 2],
 }
 
+impl ImageKeypoints {
+    /// A hash that identical images share; `None` without keypoints.
+    pub fn fingerprint(&self) -> Option<u64> {
+        use std::hash::{DefaultHasher, Hash, Hasher};
+
+        let mut hasher = DefaultHasher::new();
+        for (point, score) in self.keypoints.points().iter().zip(self.keypoints.scores()) {
+            [point.x, point.y, *score]
+                .map(f32::to_bits)
+                .hash(&mut hasher);
+        }
+        (!self.keypoints.is_empty()).then(|| hasher.finish())
+    }
+}
+
 impl ViewEmbedder<'_> {
     /// Embeds one view. `field` is its field in the request, for errors.
     ///

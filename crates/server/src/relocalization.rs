@@ -309,6 +309,15 @@ pub fn rooms_to_track_in(
     Ok(served)
 }
 
+/// Whether some adapter can track in these rooms; in any room if none is named.
+pub fn can_track(snapshot: &Snapshot, rooms: &[String]) -> bool {
+    let fitting = match rooms {
+        [] => adapters_that_track_anywhere(snapshot),
+        rooms => adapters_that_track_in_all(snapshot, rooms),
+    };
+    !fitting.is_empty()
+}
+
 fn rooms_by_adapter(
     snapshot: &Snapshot,
     rooms: &[String],

@@ -88,6 +88,11 @@ pub enum NotLocated {
 }
 
 impl NotLocated {
+    /// Whether the matches contradict the camera.
+    pub fn is_of_camera(&self) -> bool {
+        matches!(self, Self::CameraContradicted { .. })
+    }
+
     /// How far the view is beyond the limit of the worst gate; above 1. `None` if the gates do not
     /// measure it.
     pub fn novelty(&self) -> Option<f64> {

@@ -65,6 +65,15 @@ impl MatchedView {
         self.inliers >= parameters.min_inliers && self.support() >= parameters.min_support
     }
 
+    /// The row of the mapped frame with the most inliers; 0 without inliers.
+    pub fn best_frame(&self) -> usize {
+        let inliers = |frame: &&usize| {
+            let matches = self.matches.iter();
+            matches.filter(|found| found.frame == **frame).count()
+        };
+        self.frames.iter().max_by_key(inliers).copied().unwrap_or(0)
+    }
+
     /// Number of inliers times their spread: few inliers have to be spread more widely.
     pub fn support(&self) -> f64 {
         self.inliers as f64 * self.spread

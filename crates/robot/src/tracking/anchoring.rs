@@ -104,6 +104,15 @@ fn surprise_at(believed: &PoseWithCovariance, anchor: &PoseWithCovariance) -> f6
 }
 
 impl MatchedView<'_> {
+    /// Number of anchors like this one that must agree on a place.
+    pub(super) fn anchors_needed(&self) -> u32 {
+        if self.is_proven {
+            MATCHED_VIEWS_TO_AGREE
+        } else {
+            ANCHORS_TO_AGREE
+        }
+    }
+
     /// Whether the view may serve as an anchor.
     fn may_correct(&self, health: TrackingHealth) -> bool {
         if self.matches_room() {
@@ -189,11 +198,7 @@ impl Tracker {
         }
 
         if view.matches_room() {
-            let needed = if view.is_proven {
-                MATCHED_VIEWS_TO_AGREE
-            } else {
-                ANCHORS_TO_AGREE
-            };
+            let needed = view.anchors_needed();
             self.correct(state, poses, frame, (view.room, needed), anchor)
         } else {
             correct_believed(state, poses, frame, view.room, anchor)

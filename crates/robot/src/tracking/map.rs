@@ -14,7 +14,7 @@ use super::{Error, PoseWithCovariance, room_errors};
 use seese3_core::adapter::{ErrorModel, MotionErrors, TEMPORAL_NEIGHBOURS};
 use seese3_core::index::{ExactIndex, Exclusion, Index, Neighbour};
 use seese3_core::navigation::Navigator;
-use seese3_core::room::FrameId;
+use seese3_core::room::{FrameId, Room};
 use seese3_core::statistics::median;
 
 /// Maximum number of mapped frames sampled for the typical distance.
@@ -149,7 +149,7 @@ impl Map {
         let anchor_model = AnchorModel::measured(&navigator, by_latent, mapped);
 
         Ok(Self {
-            extent_m: extent(&navigator, mapped),
+            extent_m: extent_m(navigator.room(), mapped),
             motion_prior: MotionPrior::of_path(navigator.room(), mapped),
             navigator,
             error_model,
@@ -352,11 +352,11 @@ fn typical_distance(
 }
 
 /// Diagonal of the bounding box of the mapped camera positions, meters.
-fn extent(navigator: &Navigator, mapped: &[FrameId]) -> f64 {
+pub(crate) fn extent_m(room: &Room, mapped: &[FrameId]) -> f64 {
     let mut low = nalgebra::Vector3::repeat(f64::INFINITY);
     let mut high = nalgebra::Vector3::repeat(f64::NEG_INFINITY);
     for frame in mapped {
-        let position = navigator.room().poses()[frame.row()].translation.vector;
+        let position = room.poses()[frame.row()].translation.vector;
         low = low.inf(&position);
         high = high.sup(&position);
     }

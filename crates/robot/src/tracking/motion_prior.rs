@@ -11,12 +11,12 @@ use seese3_core::geometry::{Twist, body_twist};
 use seese3_core::room::{FrameId, Room};
 
 /// Covariance of a pose and a velocity.
-pub(super) type Matrix12 = SMatrix<f64, 12, 12>;
+pub(crate) type Matrix12 = SMatrix<f64, 12, 12>;
 
 /// Approximate lag of the velocity autocorrelation, seconds.
 const LAG_S: f64 = 0.2;
 /// Longest interval of mapped frames from which a velocity is computed, seconds.
-const LONGEST_STEP_S: f64 = 0.25;
+const LONGEST_STEP_S: f64 = 0.5;
 /// Minimum number of velocities for a prior of the room; otherwise the default is used.
 const FEWEST_VELOCITIES: usize = 20;
 /// Range of the velocity's correlation time, seconds.
@@ -57,7 +57,7 @@ struct Decay {
 }
 
 /// Predicted motion over a time.
-pub(super) struct Drift {
+pub(crate) struct Drift {
     /// Expected motion.
     pub motion: Twist,
     /// Expected final velocity.
@@ -96,7 +96,7 @@ impl MotionPrior {
     }
 
     /// Default prior.
-    pub(super) fn assumed() -> Self {
+    pub fn assumed() -> Self {
         let part = Part {
             variance: Matrix3::identity() * ASSUMED_VARIANCE,
             duration_s: ASSUMED_DURATION_S,
@@ -119,7 +119,7 @@ impl MotionPrior {
     }
 
     /// Predicts the motion of a camera with an initial velocity over a time, seconds.
-    pub(super) fn over(&self, velocity: &Twist, seconds: f64) -> Drift {
+    pub(crate) fn over(&self, velocity: &Twist, seconds: f64) -> Drift {
         let parts = [&self.linear, &self.angular];
         let decays = parts.map(|part| Decay::over(seconds, part.duration_s));
 

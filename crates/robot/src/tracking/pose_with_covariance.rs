@@ -5,7 +5,7 @@ use nalgebra::{Cholesky, Matrix6, Vector6};
 use seese3_core::geometry::{Pose, Twist, adjoint, exp, left_jacobian_inverse, log};
 
 /// Largest standard deviations of a usable pose: 2.5 of them are 0.5 m or 15°.
-pub(super) const PLACE_DEVIATION_M: f64 = 0.2;
+pub(crate) const PLACE_DEVIATION_M: f64 = 0.2;
 const PLACE_DEVIATION_RAD: f64 = 0.105;
 
 /// A pose with the covariance of its error δ in its own body frame: true = pose · exp(δ), δ ordered
@@ -66,6 +66,18 @@ impl PoseWithCovariance {
         Self {
             pose: self.pose * exp(&motion),
             covariance,
+        }
+    }
+
+    /// The pose after a motion `earlier_from_later` with an independent error, which is in the later
+    /// body frame.
+    #[must_use]
+    pub fn composed(&self, motion: &Self) -> Self {
+        let back = adjoint(&motion.pose.inverse());
+        let carried = back * self.covariance * back.transpose();
+        Self {
+            pose: self.pose * motion.pose,
+            covariance: symmetric(&(carried + motion.covariance)),
         }
     }
 

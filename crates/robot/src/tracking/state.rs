@@ -10,6 +10,7 @@ use super::{
 };
 use seese3_core::geometry::Twist;
 use seese3_core::index::Neighbour;
+use seese3_core::room::FrameId;
 
 /// One frame of a stream.
 #[derive(Debug, Clone, PartialEq)]
@@ -61,6 +62,18 @@ pub struct MatchedPose {
     pub pose: PoseWithCovariance,
     /// How unlike the view is to the map, relative to the limit; at most 1.
     pub novelty: f64,
+    /// The row of the mapped frame with the most matched keypoints.
+    pub best_frame: FrameId,
+}
+
+impl MatchedPose {
+    /// The mapped frame with the most matched keypoints; the distance is `novelty`.
+    pub fn best_match(&self) -> Neighbour {
+        Neighbour {
+            frame: self.best_frame,
+            distance: self.novelty,
+        }
+    }
 }
 
 /// Complete state of a tracked stream.
@@ -200,8 +213,8 @@ pub struct Update {
     pub out_of_distribution: f64,
     /// The only map, or the one in which the camera was localized.
     pub room: Option<usize>,
-    /// Map and mapped frame that are most similar to the view.
-    pub best_match: (usize, Neighbour),
+    /// Map and mapped frame that are most similar to the view, if any is.
+    pub best_match: Option<(usize, Neighbour)>,
     /// The other camera of that view; `None` for the stream's own camera.
     pub best_camera: Option<u32>,
     /// Whether that match corrected the map pose.
@@ -210,6 +223,8 @@ pub struct Update {
     pub surprise: Option<f64>,
     /// Hypothesis for the map pose on which recent anchors agree.
     pub candidate: Option<Candidate>,
+    /// Number of anchors that must agree on it.
+    pub anchors_needed: u32,
 }
 
 /// Why a frame was rejected. A rejected frame does not change the state of the stream.

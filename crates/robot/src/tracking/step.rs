@@ -188,11 +188,12 @@ impl Tracker {
             reason,
             out_of_distribution: best.matched.out_of_distribution,
             room: state.room,
-            best_match: (best.room, best.matched.nearest[0]),
+            best_match: Some((best.room, best.matched.nearest[0])),
             best_camera: best.other.map(|other| other.camera),
             match_used: correction.is_applied,
             surprise: correction.surprise,
             candidate: state.candidate.clone(),
+            anchors_needed: best.anchors_needed(),
         }
     }
 

@@ -11,4 +11,5 @@ mod fitting;
 mod localization;
 mod matched_views;
 mod multi_step;
+mod pose_filter;
 mod tracking;

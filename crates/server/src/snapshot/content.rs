@@ -1,10 +1,11 @@
 //! Content hashes of a room and an adapter, which identify what tracking states are based on.
 
-use ndarray::s;
+use ndarray::{ArrayView2, s};
 use sha2::{Digest, Sha256};
 
 use seese3_core::adapter::{Adapter, ErrorStatistics, Network};
 use seese3_core::navigation::Navigator;
+use seese3_core::room::Room;
 
 /// Content hashes of a room and an adapter. Names and revisions are not sufficient: two stores may
 /// use the same ones for different content.
@@ -21,20 +22,28 @@ impl Content {
     pub fn of(navigator: &Navigator) -> Self {
         Self {
             adapter: adapter_content(navigator.adapter()),
-            frames: frames_content(navigator, navigator.room().frame_count()),
+            frames: frames_content(
+                navigator.room(),
+                Some(navigator.latents()),
+                navigator.room().frame_count(),
+            ),
         }
     }
 }
 
-/// SHA-256 of the poses and latents of a room's first `frame_count` frames. The room must have at
-/// least that many.
+/// SHA-256 of the poses and, if given, the latents of a room's first `frame_count` frames. The room
+/// must have at least that many.
 ///
 /// Rotations are rounded to 1e-6: extending a room republishes its frames and projects their
 /// rotations onto SO(3) again, which may change the last digits.
-pub fn frames_content(navigator: &Navigator, frame_count: usize) -> [u8; 32] {
+pub fn frames_content(
+    room: &Room,
+    latents: Option<ArrayView2<'_, f64>>,
+    frame_count: usize,
+) -> [u8; 32] {
     let mut digest = ContentDigest(Sha256::new());
 
-    for pose in &navigator.room().poses()[..frame_count] {
+    for pose in &room.poses()[..frame_count] {
         digest.numbers(&pose.translation.vector);
         let rotation = pose.rotation.to_rotation_matrix();
         for entry in rotation.matrix() {
@@ -42,7 +51,9 @@ pub fn frames_content(navigator: &Navigator, frame_count: usize) -> [u8; 32] {
             digest.0.update(millionths.to_le_bytes());
         }
     }
-    digest.numbers(navigator.latents().slice(s![..frame_count, ..]));
+    if let Some(latents) = latents {
+        digest.numbers(latents.slice(s![..frame_count, ..]));
+    }
 
     digest.0.finalize().into()
 }

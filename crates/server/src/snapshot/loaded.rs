@@ -9,6 +9,7 @@ use seese3_core::eval::TrainedOn;
 use seese3_core::features::FeatureSource;
 use seese3_core::keypoints::KeypointSource;
 use seese3_core::navigation::Navigator;
+use seese3_core::room::Room;
 use seese3_robot::fitting::RoomReader;
 use seese3_robot::localization::KeypointRoom;
 use seese3_robot::tracking::Map;
@@ -25,6 +26,8 @@ pub struct Candidate {
 
 /// A room with its navigators, loaded into memory.
 pub struct LoadedRoom {
+    /// The room.
+    pub room: Arc<Room>,
     /// One for each adapter that serves the room, in order of preference.
     pub navigators: Vec<Arc<ServedNavigator>>,
     /// The keypoints of the room, if it has any.
@@ -94,8 +97,7 @@ impl LoadedRoom {
 
     /// Approximate memory use, bytes.
     pub(super) fn memory_bytes(&self) -> usize {
-        let room = self.navigators.first();
-        let room = room.map_or(0, |served| served.navigator.room().memory_bytes());
+        let room = self.room.memory_bytes();
         let keypoints = self.keypoints.as_ref();
         let keypoints = keypoints.map_or(0, |keypoints| keypoints.room.memory_bytes());
         let navigators = self.navigators.iter();

@@ -9,7 +9,7 @@ mod loaded;
 mod served;
 
 pub use content::frames_content;
-pub use loaded::ServedNavigator;
+pub use loaded::{ServedKeypoints, ServedNavigator};
 pub use loading::{Loader, Refused, RoomMemory};
 use room_loading::Problem;
 pub use served::ServedRoom;

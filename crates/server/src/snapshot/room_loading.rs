@@ -158,6 +158,7 @@ impl RoomLoader {
         }
 
         Ok(LoadedRoom {
+            room: frames,
             navigators,
             keypoints,
             refused,

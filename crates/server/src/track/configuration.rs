@@ -8,6 +8,7 @@ use super::super::relocalization::rooms_to_track_in;
 use super::super::snapshot::{ServedNavigator, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::Pose;
+use seese3_robot::pose_filter::FilterParameters;
 use seese3_robot::tracking::{Drift, MeasuredPose, PoseWithCovariance, TrackerSettings};
 
 /// Default standard deviation of a given pose, by axis: 0.1 m and 0.1 rad.
@@ -94,21 +95,56 @@ pub fn settings(
         return Err(Error::invalid("keyframes.frames", "must be at least 1"));
     }
 
-    let fuse = match pb::Fusion::try_from(config.fusion) {
-        Ok(pb::Fusion::Unspecified | pb::Fusion::Anchors) => true,
-        Ok(pb::Fusion::None) => false,
-        Err(_) => {
-            return Err(Error::invalid(
-                "fusion",
-                format!("{} is no value of Fusion", config.fusion),
-            ));
-        }
-    };
-
     Ok(TrackerSettings {
         keyframe_frames: frames.unwrap_or(plain.keyframe_frames),
         keyframe_displacement: displacement.unwrap_or(plain.keyframe_displacement),
-        fuse,
+        fuse: is_fused(config.fusion)?,
+    })
+}
+
+/// Whether the map corrects the pose.
+pub fn is_fused(fusion: i32) -> Result<bool, Error> {
+    match pb::Fusion::try_from(fusion) {
+        Ok(pb::Fusion::Unspecified | pb::Fusion::Anchors) => Ok(true),
+        Ok(pb::Fusion::None) => Ok(false),
+        Err(_) => Err(Error::invalid(
+            "fusion",
+            format!("{fusion} is no value of Fusion"),
+        )),
+    }
+}
+
+/// The parameters of a stream that tracks by keypoints alone.
+///
+/// # Errors
+/// [`Error::Invalid`] on a field that is not valid, or that needs an adapter.
+pub fn parameters(config: &pb::TrackConfig) -> Result<FilterParameters, Error> {
+    let unused = |field: &str| {
+        let problem = "needs an adapter that can track in these rooms; leave it out";
+        Err(Error::invalid(field, problem))
+    };
+    let pb::KeyframePolicy {
+        displacement,
+        frames,
+    } = config.keyframes.unwrap_or_default();
+    if displacement.is_some() {
+        return unused("keyframes.displacement");
+    }
+    if frames == Some(0) {
+        return Err(Error::invalid("keyframes.frames", "must be at least 1"));
+    }
+    if config.gravity_in_map.is_some() {
+        return unused("gravity_in_map");
+    }
+    if !config.other_cameras.is_empty() {
+        return unused("other_cameras");
+    }
+
+    let default = FilterParameters::default();
+    Ok(FilterParameters {
+        keyframe_frames: frames.unwrap_or(default.keyframe_frames),
+        fuse: is_fused(config.fusion)?,
+        ..default
     })
 }
 

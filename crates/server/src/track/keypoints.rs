@@ -1,14 +1,13 @@
 //! Matches the images of a stream with the keypoints of its rooms.
 
-use std::sync::Arc;
-
 use super::super::embedding::ImageKeypoints;
 use super::super::image_view::check_aspect;
-use super::super::snapshot::ServedNavigator;
 use super::super::{Error, convert};
+use super::rooms::TrackedRoom;
 use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::{CameraIntrinsics, Pose};
 use seese3_core::keypoints::{KeypointSource, Keypoints};
+use seese3_core::room::FrameId;
 use seese3_core::statistics::median;
 use seese3_robot::localization::{
     KeypointRoom, LocatedView, NotLocated, focal_of_view, simple_camera,
@@ -45,10 +44,10 @@ pub struct FocalSearch {
 
 /// What the images of a stream are matched with.
 pub struct StreamRooms<'a> {
-    pub served: &'a [Arc<ServedNavigator>],
+    pub rooms: &'a [TrackedRoom],
     /// The source of the image's keypoints.
     pub source: &'a KeypointSource,
-    /// The stream's room, an index of `served`; `None` while it is unknown.
+    /// The stream's room, an index of `rooms`; `None` while it is unknown.
     pub room: Option<usize>,
     /// The last pose of the camera in that room, `world_from_camera`.
     pub predicted: Option<Pose>,
@@ -59,16 +58,17 @@ pub struct StreamRooms<'a> {
 pub struct StreamMatch {
     /// The pose; `None` if no room locates the view.
     pub pose: Option<MatchedPose>,
-    /// The camera that the matches contradict.
-    pub contradicted: Option<NotLocated>,
+    /// Why no room locates the view: the camera that the matches contradict, else the reason of the
+    /// most similar room. `None` while the camera is unknown.
+    pub why_not: Option<NotLocated>,
 }
 
 impl StreamRooms<'_> {
     /// The rooms to match, with their indices.
     fn candidates(&self) -> impl Iterator<Item = (usize, &KeypointRoom)> {
-        let served = self.served.iter().enumerate();
-        served.filter_map(|(place, served)| {
-            let keypoints = served.keypoints.as_ref()?;
+        let rooms = self.rooms.iter().enumerate();
+        rooms.filter_map(|(place, room)| {
+            let keypoints = room.keypoints.as_ref()?;
             let is_asked = self.room.is_none_or(|room| room == place);
             let is_matched = is_asked && keypoints.source.is_like(self.source);
             is_matched.then_some((place, keypoints.room.as_ref()))
@@ -132,7 +132,7 @@ impl StreamCamera {
 
         let is_only = rooms.candidates().count() == 1;
         let mut best: Option<(usize, LocatedView)> = None;
-        let mut contradicted = None;
+        let mut reasons = Vec::new();
         for (place, room) in rooms.candidates() {
             let camera = match self {
                 Self::Stated(camera) | Self::Estimated(camera) => *camera,
@@ -156,20 +156,26 @@ impl StreamCamera {
                         best = Some((place, found));
                     }
                 }
-                Err(why @ NotLocated::CameraContradicted { .. }) => contradicted = Some(why),
-                Err(_) => {}
+                Err(why) => reasons.push(why),
             }
         }
 
-        if best.is_none() && contradicted.is_some() {
+        let novelty = |why: &NotLocated| match why {
+            NotLocated::CameraContradicted { .. } => 0.0,
+            other => other.novelty().unwrap_or(f64::INFINITY),
+        };
+        reasons.sort_by(|a, b| novelty(a).total_cmp(&novelty(b)));
+        let why_not = reasons.first().filter(|_| best.is_none()).copied();
+        if why_not.is_some_and(|why| why.is_of_camera()) {
             self.restart();
         }
         Ok(StreamMatch {
-            contradicted: contradicted.filter(|_| best.is_none()),
+            why_not,
             pose: best.map(|(room, found)| MatchedPose {
                 room,
                 pose: found.pose,
                 novelty: found.novelty,
+                best_frame: FrameId(found.matched.best_frame() as u32),
             }),
         })
     }

@@ -5,7 +5,9 @@
 //! [`Session`] on a worker thread.
 
 mod configuration;
+mod engine;
 mod keypoints;
+mod rooms;
 mod sealed;
 mod sensors;
 mod session;

@@ -4,24 +4,22 @@
 //! It has no field tags and is not part of the public API. A change of [`Sealed`] or of the
 //! tracker's state types needs a new `MAGIC` in `token`.
 
-use std::sync::Arc;
-
 use prost::Message;
 use serde::{Deserialize, Serialize};
 
 use super::super::Error;
-use super::super::snapshot::{ServedNavigator, frames_content};
+use super::engine::EngineState;
+use super::rooms::TrackedRoom;
 use seese3_client::proto::v1 as pb;
-use seese3_robot::tracking::State;
 
 /// Content of a token.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 pub struct Sealed {
     /// The stream's `TrackConfig`, encoded as protobuf.
     config: Vec<u8>,
-    /// Digest of the adapter, `Content::adapter`.
+    /// Digest of the adapter, `Content::adapter`; empty without one.
     adapter: Vec<u8>,
-    state: State,
+    state: EngineState,
     /// The rooms that the state refers to.
     rooms: Vec<SealedRoom>,
 }
@@ -33,58 +31,50 @@ struct SealedRoom {
     place: usize,
     name: String,
     frame_count: usize,
-    /// Digest of the room's first `frame_count` frames, `Content::frames`.
+    /// Digest of the room's first `frame_count` frames, [`TrackedRoom::frames_content`].
     frames: Vec<u8>,
 }
 
 impl SealedRoom {
-    /// The rooms of `served` that a state refers to.
-    fn named_by(state: &State, served: &[Arc<ServedNavigator>]) -> Vec<Self> {
-        let candidate = state.candidate.as_ref().map(|candidate| candidate.room);
-        let mut places: Vec<usize> = state.room.into_iter().chain(candidate).collect();
+    /// The rooms that a state refers to.
+    fn named_by(state: &mut EngineState, rooms: &[TrackedRoom]) -> Vec<Self> {
+        let mut places: Vec<usize> = state.rooms().map(|place| *place).collect();
         places.dedup();
 
         let sealed = |place: usize| {
-            let room = served[place].navigator.room();
+            let tracked = &rooms[place];
+            let frame_count = tracked.room.frame_count();
+            let frames = tracked.frames_content(frame_count);
             Self {
                 place,
-                name: room.id().to_string(),
-                frame_count: room.frame_count(),
-                frames: served[place].content.frames.to_vec(),
+                name: tracked.room.id().to_string(),
+                frame_count,
+                frames: frames.map_or_else(Vec::new, |frames| frames.to_vec()),
             }
         };
         places.into_iter().map(sealed).collect()
     }
 
-    /// The index in `served` of a room with the same name that begins with the same frames. The
-    /// state's poses and latents are valid there.
-    fn place_in(&self, served: &[Arc<ServedNavigator>]) -> Option<usize> {
-        let is_this = |served: &Arc<ServedNavigator>| {
-            let room = served.navigator.room();
-            if room.id().as_str() != self.name || self.frame_count > room.frame_count() {
-                return false;
-            }
-
-            let frames = if self.frame_count == room.frame_count() {
-                served.content.frames
-            } else {
-                frames_content(&served.navigator, self.frame_count)
-            };
-            frames.as_slice() == self.frames
+    /// The index of a room with the same name that begins with the same frames. The state's poses
+    /// and latents are valid there.
+    fn place_in(&self, rooms: &[TrackedRoom]) -> Option<usize> {
+        let is_this = |tracked: &TrackedRoom| {
+            let frames = tracked.frames_content(self.frame_count);
+            tracked.room.id().as_str() == self.name
+                && frames.is_some_and(|frames| frames.as_slice() == self.frames)
         };
-
-        served.iter().position(is_this)
+        rooms.iter().position(is_this)
     }
 }
 
 impl Sealed {
-    /// The content of a token for this configuration and state; `served` are the stream's rooms.
-    pub fn new(config: &pb::TrackConfig, state: &State, served: &[Arc<ServedNavigator>]) -> Self {
+    /// The content of a token for this configuration and state of a stream.
+    pub fn new(config: &pb::TrackConfig, mut state: EngineState, rooms: &[TrackedRoom]) -> Self {
         Self {
             config: config.encode_to_vec(),
-            adapter: served[0].content.adapter.to_vec(),
-            state: state.clone(),
-            rooms: SealedRoom::named_by(state, served),
+            adapter: rooms[0].adapter_content().to_vec(),
+            rooms: SealedRoom::named_by(&mut state, rooms),
+            state,
         }
     }
 
@@ -113,26 +103,21 @@ impl Sealed {
         pb::TrackConfig::decode(self.config.as_slice()).map_err(|_| Error::Internal)
     }
 
-    /// The state with room indices mapped to `served`; `None` if the adapter or a room differs from
-    /// the token's.
-    pub fn opened_in(self, served: &[Arc<ServedNavigator>]) -> Option<State> {
-        let is_adapter = |served: &Arc<ServedNavigator>| served.content.adapter == *self.adapter;
-        if !served.iter().all(is_adapter) {
+    /// The state with its room indices mapped to `rooms`; `None` if the adapter or a room differs
+    /// from the token's.
+    pub fn opened_in(self, rooms: &[TrackedRoom]) -> Option<EngineState> {
+        if rooms
+            .iter()
+            .any(|room| room.adapter_content() != self.adapter)
+        {
             return None;
         }
 
-        let place_here = |place: usize| {
-            let mut rooms = self.rooms.iter();
-            rooms.find(|room| room.place == place)?.place_in(served)
-        };
         let mut state = self.state;
-        if let Some(room) = &mut state.room {
-            *room = place_here(*room)?;
+        for place in state.rooms() {
+            let mut sealed = self.rooms.iter();
+            *place = sealed.find(|room| room.place == *place)?.place_in(rooms)?;
         }
-        if let Some(candidate) = &mut state.candidate {
-            candidate.room = place_here(candidate.room)?;
-        }
-
         Some(state)
     }
 }
@@ -145,7 +130,7 @@ mod tests {
     use seese3_core::geometry::{Pose, Twist};
     use seese3_robot::tracking::{
         Candidate, Keyframe, LastFrame, LastMeasured, OdometryAccumulator, OdometryDelta,
-        OtherCamera, Place, PoseVelocity, PoseWithCovariance, RecentMatches, TrackingHealth,
+        OtherCamera, Place, PoseVelocity, PoseWithCovariance, RecentMatches, State, TrackingHealth,
     };
 
     fn odd_moving(pose: Pose) -> PoseVelocity {
@@ -261,7 +246,7 @@ mod tests {
             let sealed = Sealed {
                 config: Vec::new(),
                 adapter: Vec::new(),
-                state,
+                state: EngineState::Adapter(state),
                 rooms: Vec::new(),
             };
             let bytes = sealed.to_bytes();

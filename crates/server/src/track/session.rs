@@ -7,19 +7,24 @@ use super::super::Error;
 use super::super::convert;
 use super::super::embedding::{EmbeddedView, ImageKeypoints, StoredFrames, ViewEmbedder};
 use super::super::relocalization::maps;
-use super::super::snapshot::{ServedNavigator, Snapshot};
+use super::super::snapshot::Snapshot;
 use super::Overtaken;
-use super::configuration::{StreamFrames, back_pressure, rooms, settings};
+use super::configuration::{StreamFrames, back_pressure, is_fused, parameters, rooms, settings};
+use super::engine::Engine;
 use super::keypoints::{StreamCamera, StreamMatch, StreamRooms};
+use super::rooms::{TrackedRoom, rooms_with_keypoints};
 use super::sealed::Sealed;
 use super::sensors::Sensors;
 use super::token::TokenKey;
 use super::wire;
+use pb::TrackRefusalReason as Reason;
 use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::Pose;
-use seese3_core::keypoints::KeypointSource;
+use seese3_core::keypoints::{KeypointSource, Keypoints};
+use seese3_robot::localization::NotLocated;
+use seese3_robot::pose_filter::ViewObservation;
 use seese3_robot::tracking::{
-    Observation, OtherView, PoseWithCovariance, Refusal, State, Status, Tracker, Update,
+    Observation, OtherView, PoseWithCovariance, Refusal, Status, Tracker, Update,
 };
 
 const FIELD: &str = "config";
@@ -30,15 +35,14 @@ pub struct Session {
     /// Snapshot without rooms, for the image encoders. A stream may last for days and must not keep
     /// replaced rooms in memory.
     encoders: Snapshot,
-    served: Vec<Arc<ServedNavigator>>,
-    tracker: Tracker,
+    rooms: Vec<TrackedRoom>,
+    engine: Engine,
     config: pb::TrackConfig,
     frames: StreamFrames,
     sensors: Sensors,
     camera: StreamCamera,
     /// The last map pose while TRACKING, `world_from_camera`.
     last_pose: Option<Pose>,
-    state: State,
     key: TokenKey,
 }
 
@@ -84,12 +88,12 @@ impl Session {
         })?;
 
         // The state's latents and poses are valid only with the same adapter and rooms.
-        session.state = sealed.opened_in(&session.served).ok_or_else(|| {
+        let state = sealed.opened_in(&session.rooms).ok_or_else(|| {
             let problem = "this server has another room or adapter than the token; start anew";
             Error::Precondition(format!("{field}: {problem}"))
         })?;
 
-        if !session.fits() {
+        if !session.engine.resume(state, &session.rooms) {
             return Err(Error::Precondition(format!(
                 "{field}: was sealed by a server of another version; start anew"
             )));
@@ -98,63 +102,12 @@ impl Session {
         Ok(session)
     }
 
-    /// Whether the state's latents have this adapter's width and its room indices are valid. The
-    /// content digests should guarantee this; an invalid state would panic in the tracker.
-    fn fits(&self) -> bool {
-        let adapter = &self.served[0].adapter.adapter;
-        let rooms = self.served.len();
-
-        let State {
-            room,
-            last,
-            keyframe,
-            place,
-            recent,
-            candidate,
-            other_cameras,
-            recent_matches: _,
-            seen_ns: _,
-            gravity_ns: _,
-            initial_pose: _,
-            health: _,
-            frames_off_map: _,
-            unchanged_frames: _,
-            corrected_ns: _,
-            measured: _,
-        } = &self.state;
-
-        let latents = [
-            last.as_ref().map(|last| &last.latent),
-            keyframe.as_ref().map(|keyframe| &keyframe.latent),
-            place.as_ref().and_then(|place| place.latent.as_ref()),
-            candidate
-                .as_ref()
-                .and_then(|candidate| candidate.latent.as_ref()),
-        ];
-
-        let named = [*room, candidate.as_ref().map(|candidate| candidate.room)];
-        latents
-            .into_iter()
-            .flatten()
-            .all(|latent| adapter.check_latent(latent).is_ok())
-            && recent
-                .iter()
-                .chain(other_cameras.iter().map(|other| &other.last))
-                .all(|row| row.len() == adapter.coordinate_count())
-            && named.into_iter().flatten().all(|room| room < rooms)
-    }
-
     fn configured(
         snapshot: &Arc<Snapshot>,
         config: pb::TrackConfig,
         key: &TokenKey,
     ) -> Result<Self, Error> {
         // Validate everything before the stream starts.
-        let served = rooms(snapshot, &config)?;
-        let adapter = &served[0].adapter;
-        let maps = maps(&served)?;
-        let settings = settings(&config, &adapter.adapter)?;
-
         let frames = StreamFrames::of(&config)?;
         let sensors = Sensors::of(&config, &frames)?;
         let camera = StreamCamera::of(&config)?;
@@ -174,28 +127,46 @@ impl Session {
         };
 
         // Dead reckoning never localizes the camera, so it needs an initial pose.
-        if !settings.fuse && begins.is_none() {
+        if !is_fused(config.fusion)? && begins.is_none() {
             return Err(Error::invalid(
                 "fusion",
                 "FUSION_NONE needs room and initial_pose; give both, or use FUSION_ANCHORS",
             ));
         }
 
-        let tracker =
-            Tracker::new(maps, settings).map_err(|error| Error::Precondition(error.to_string()))?;
-        let state = tracker.start(begins);
+        let (rooms, engine) = match rooms_with_keypoints(snapshot, &config)? {
+            Some(rooms) => {
+                let parameters = parameters(&config)?;
+                let engine = Engine::of_keypoints(&rooms, parameters, begins.as_ref());
+                (rooms, engine.ok_or(Error::Internal)?)
+            }
+            None => {
+                let served = rooms(snapshot, &config)?;
+                let settings = settings(&config, &served[0].adapter.adapter)?;
+                let tracker = Tracker::new(maps(&served)?, settings)
+                    .map_err(|error| Error::Precondition(error.to_string()))?;
+                let state = tracker.start(begins);
+                let rooms = served.into_iter().map(TrackedRoom::under).collect();
+                (rooms, Engine::Adapter { tracker, state })
+            }
+        };
+
         Ok(Self {
             encoders: snapshot.without_rooms(),
-            served,
-            tracker,
+            rooms,
+            engine,
             config,
             frames,
             sensors,
             camera,
             last_pose: None,
-            state,
             key: key.clone(),
         })
+    }
+
+    /// The stream's room; `None` while it is unknown.
+    fn room(&self) -> Option<&TrackedRoom> {
+        Some(&self.rooms[self.engine.room()?])
     }
 
     /// Whether only the newest of the waiting frames is answered.
@@ -205,21 +176,25 @@ impl Session {
 
     /// The first answer of a stream: adapter, room, frame names and keyframe policy in effect.
     pub fn started(&self) -> pb::TrackResponse {
-        let adapter = &self.served[0].adapter;
-        let settings = self.tracker.settings();
+        let keyframes = match &self.engine {
+            Engine::Adapter { tracker, .. } => pb::KeyframePolicy {
+                displacement: Some(tracker.settings().keyframe_displacement),
+                frames: Some(tracker.settings().keyframe_frames),
+            },
+            Engine::Keypoints { filter, .. } => pb::KeyframePolicy {
+                displacement: None,
+                frames: Some(filter.parameters().keyframe_frames),
+            },
+        };
 
+        let served = self.rooms[0].served.as_ref();
+        let calibrated_on = served.map_or(0, |served| served.adapter.record.calibrated_on.len());
         let started = pb::TrackStarted {
-            adapter: Some(convert::adapter_revision(&self.served[0])),
-            room: self
-                .state
-                .room
-                .map(|room| convert::room_revision(&self.served[room])),
+            adapter: served.map(|served| convert::adapter_revision(served)),
+            room: self.room().map(|room| room.revision.clone()),
             frames: Some(self.frames.names.clone()),
-            keyframes: Some(pb::KeyframePolicy {
-                displacement: Some(settings.keyframe_displacement),
-                frames: Some(settings.keyframe_frames),
-            }),
-            calibration_rooms: adapter.record.calibrated_on.len() as u32,
+            keyframes: Some(keyframes),
+            calibration_rooms: calibrated_on as u32,
         };
 
         self.answer(pb::track_response::Answer::Started(started))
@@ -249,7 +224,7 @@ impl Session {
                 let best_camera = update
                     .best_camera
                     .map_or_else(String::new, |number| self.sensors.camera_name(number));
-                let update = wire::update(&update, &self.frames, &self.served);
+                let update = wire::update(&update, &self.frames, &self.rooms);
 
                 // Measured from the frame's arrival, including the wait for a thread.
                 let elapsed_ns =
@@ -319,7 +294,7 @@ impl Session {
         // An invalid pose is refused; the stream and its state continue unchanged.
         let answer = match self.place_of(given) {
             Ok(place) => {
-                self.tracker.set_pose(&mut self.state, place);
+                self.engine.set_pose(place);
                 pb::track_response::Answer::Acknowledged(pb::TrackAcknowledged {})
             }
             Err(error) => pb::track_response::Answer::Refusal(pb::TrackRefusal {
@@ -339,12 +314,12 @@ impl Session {
             .ok_or_else(|| Error::invalid(field, "is required"))?;
 
         // The pose is in one room's world frame, so the room must be known.
-        let room = self.state.room.ok_or_else(|| {
+        let room = self.room().ok_or_else(|| {
             Error::Precondition(format!(
                 "{field}: the room is not known yet; name it in the configuration"
             ))
         })?;
-        let name = self.served[room].navigator.room().id().to_string();
+        let name = room.room.id().to_string();
 
         self.frames
             .known_pose(given, &name)
@@ -354,7 +329,7 @@ impl Session {
     /// Restarts tracking with the same configuration, but without its initial pose: the camera has
     /// moved since.
     pub fn reset(&mut self) -> pb::TrackResponse {
-        self.state = self.tracker.start(None);
+        self.engine.reset();
         self.camera.restart();
         self.last_pose = None;
         self.answer(pb::track_response::Answer::Acknowledged(
@@ -362,21 +337,10 @@ impl Session {
         ))
     }
 
-    /// Encodes the view in `field`. Only an image can be detected as blank.
-    fn encoded_view(&self, field: &str, view: Option<pb::View>) -> Result<EmbeddedView, Error> {
-        let embedder = ViewEmbedder {
-            adapter: &self.served[0].adapter,
-            snapshot: &self.encoders,
-            frames: StoredFrames::Refused,
-            detector: None,
-        };
-        embedder.embed(field, view)
-    }
-
     /// The source of the keypoints of images: the first of a room that this server can detect.
     fn keypoint_source(&self) -> Option<&KeypointSource> {
-        let served = self.served.iter();
-        let mut sources = served.filter_map(|served| Some(&served.keypoints.as_ref()?.source));
+        let rooms = self.rooms.iter();
+        let mut sources = rooms.filter_map(|room| Some(&room.keypoints.as_ref()?.source));
         sources.find(|source| self.encoders.keypoint_encoder(source).is_some())
     }
 
@@ -386,25 +350,24 @@ impl Session {
             return Ok(StreamMatch::default());
         };
         let rooms = StreamRooms {
-            served: &self.served,
+            rooms: &self.rooms,
             source: &source,
-            room: self.state.room,
+            room: self.engine.room(),
             predicted: self.last_pose,
         };
         self.camera.matched("frame.view.image", image, &rooms)
     }
 
-    /// Encodes the view of the stream's own camera, with the keypoints of an image if a room has
-    /// some and this server can detect them.
-    fn encoded_own_view(&self, view: Option<pb::View>) -> Result<EmbeddedView, Error> {
-        let source = self.keypoint_source();
-        let embedder = ViewEmbedder {
-            adapter: &self.served[0].adapter,
+    /// An embedder of images, features and latents for the stream's adapter, which also detects
+    /// keypoints if `detects` and a room has some that this server can detect.
+    fn embedder(&self, detects: bool) -> Result<ViewEmbedder<'_>, Error> {
+        let source = self.keypoint_source().filter(|_| detects);
+        Ok(ViewEmbedder {
+            adapter: self.rooms[0].adapter().ok_or(Error::Internal)?,
             snapshot: &self.encoders,
             frames: StoredFrames::Refused,
             detector: source.and_then(|source| self.encoders.keypoint_encoder(source)),
-        };
-        embedder.embed("frame.view", view)
+        })
     }
 
     /// Encodes the views of a frame's other cameras.
@@ -423,12 +386,13 @@ impl Session {
                 ));
             }
 
+            let embedder = self.embedder(false)?;
             let EmbeddedView {
                 latent,
                 feature,
                 is_blank,
                 keypoints: _,
-            } = self.encoded_view(&format!("{field}.view"), given.view)?;
+            } = embedder.embed(&format!("{field}.view"), given.view)?;
             seen.push(OtherView {
                 camera: camera.number,
                 camera_from_other: camera.camera_from_other,
@@ -442,8 +406,30 @@ impl Session {
     }
 
     fn observe(&mut self, frame: pb::TrackFrame) -> Result<Update, Refused> {
-        use pb::TrackRefusalReason as Reason;
+        let (update, contradicted) = match self.engine {
+            Engine::Adapter { .. } => self.observe_latent(frame),
+            Engine::Keypoints { .. } => self.observe_keypoints(frame),
+        }?;
 
+        let tracked = update
+            .map_pose
+            .filter(|_| update.status == Status::Tracking);
+        self.last_pose = tracked.map(|tracked| tracked.pose);
+        Ok(match contradicted {
+            Some(why) => Update {
+                reason: format!("{}; keypoints are not used: {why}", update.reason),
+                ..update
+            },
+            None => update,
+        })
+    }
+
+    /// Passes a frame to the tracker of the adapter. Also returns the camera that the keypoints
+    /// contradict.
+    fn observe_latent(
+        &mut self,
+        frame: pb::TrackFrame,
+    ) -> Result<(Update, Option<NotLocated>), Refused> {
         let pb::TrackFrame {
             timestamp_ns,
             sequence,
@@ -454,23 +440,16 @@ impl Session {
             other_views,
         } = frame;
 
-        let refused = |reason: Reason| {
-            move |error: Error| match error {
-                Error::Invalid { .. } | Error::Precondition(_) => {
-                    Refused::Frame(reason, error.to_string())
-                }
-                // Any other error is the server's and ends the stream.
-                other => Refused::Server(other),
-            }
-        };
-
         let EmbeddedView {
             latent,
             feature,
             is_blank,
             keypoints,
-        } = self.encoded_own_view(view).map_err(refused(Reason::View))?;
-        let StreamMatch { pose, contradicted } = match keypoints {
+        } = self
+            .embedder(true)
+            .and_then(|embedder| embedder.embed("frame.view", view))
+            .map_err(refused(Reason::View))?;
+        let matched = match keypoints {
             Some(image) if !is_blank => self.matched(&image).map_err(refused(Reason::View))?,
             _ => StreamMatch::default(),
         };
@@ -491,38 +470,96 @@ impl Session {
             sequence,
             latent,
             feature,
-            matched: pose,
+            matched: matched.pose,
             is_blank,
             measured,
             gravity,
             other_views,
         };
 
-        // The tracker refuses late and duplicate frames. A refused frame does not change the state.
-        let update = self.tracker.observe(&mut self.state, &observation);
-        let mut update = update.map_err(|refusal| {
-            let reason = match &refusal {
-                Refusal::Late { .. } => Reason::Late,
-                Refusal::Duplicate { .. } => Reason::Duplicate,
-                Refusal::View(_) => Reason::View,
-            };
-            Refused::Frame(reason, refusal.to_string())
-        })?;
+        let Engine::Adapter { tracker, state } = &mut self.engine else {
+            return Err(Refused::Server(Error::Internal));
+        };
+        let update = tracker.observe(state, &observation)?;
+        let contradicted = matched.why_not.filter(NotLocated::is_of_camera);
+        Ok((update, contradicted))
+    }
 
-        let tracked = update
-            .map_pose
-            .filter(|_| update.status == Status::Tracking);
-        self.last_pose = tracked.map(|tracked| tracked.pose);
-        if let Some(why) = contradicted {
-            update.reason = format!("{}; keypoints are not used: {why}", update.reason);
+    /// Passes a frame to the filter of located views.
+    fn observe_keypoints(
+        &mut self,
+        frame: pb::TrackFrame,
+    ) -> Result<(Update, Option<NotLocated>), Refused> {
+        let unused = |reason: Reason, field: &str| {
+            let problem = "needs an adapter that can track in this room; leave it out";
+            refused(reason)(Error::invalid(field, problem))
+        };
+        if frame.odometry.is_some() {
+            return Err(unused(Reason::Odometry, "frame.odometry"));
         }
-        Ok(update)
+        if frame.gravity.is_some() {
+            return Err(unused(Reason::Gravity, "frame.gravity"));
+        }
+        if !frame.other_views.is_empty() {
+            return Err(unused(Reason::View, "frame.other_views"));
+        }
+
+        let image = self.detected(frame.view).map_err(refused(Reason::View))?;
+        let matched = self.matched(&image).map_err(refused(Reason::View))?;
+        let why_not = matched.why_not;
+        let novelty = match &matched.pose {
+            Some(pose) => pose.novelty,
+            None => why_not
+                .and_then(|why| why.novelty())
+                .unwrap_or(f64::INFINITY),
+        };
+        let unlocated = match why_not {
+            Some(why) => why.to_string(),
+            None if matched.pose.is_some() => String::new(),
+            None => "the focal length of the camera is not estimated yet".to_owned(),
+        };
+        let observation = ViewObservation {
+            time_ns: frame.timestamp_ns,
+            sequence: frame.sequence,
+            matched: matched.pose,
+            novelty,
+            unlocated,
+            fingerprint: image.fingerprint(),
+        };
+
+        let Engine::Keypoints { filter, state } = &mut self.engine else {
+            return Err(Refused::Server(Error::Internal));
+        };
+        Ok((filter.observe(state, &observation)?, None))
+    }
+
+    /// The keypoints of an image, for a stream without an adapter.
+    fn detected(&self, view: Option<pb::View>) -> Result<ImageKeypoints, Error> {
+        let Some(pb::view::View::Image(image)) = view.and_then(|view| view.view) else {
+            return Err(Error::invalid(
+                "frame.view",
+                "must be an image: the stream has no adapter for features and latents",
+            ));
+        };
+        let encoder = self
+            .keypoint_source()
+            .and_then(|source| self.encoders.keypoint_encoder(source))
+            .ok_or(Error::Internal)?;
+        let pixels = encoder.decoded("frame.view.image", &image)?;
+        let size = [pixels.width, pixels.height];
+        let keypoints = if pixels.is_blank() {
+            Keypoints::default()
+        } else {
+            let frame = encoder.frame_of("frame.view.image", pixels)?;
+            frame.keypoints.unwrap_or_default()
+        };
+        Ok(ImageKeypoints { keypoints, size })
     }
 
     fn answer(&self, answer: pb::track_response::Answer) -> pb::TrackResponse {
         // The token carries the whole state, so that the stream can resume after a restart or on
         // another server.
-        let sealed = Sealed::new(&self.config, &self.state, &self.served);
+        let sealed = Sealed::new(&self.config, self.engine.state(), &self.rooms);
         pb::TrackResponse {
             answer: Some(answer),
             resume_token: self.key.seal(&sealed.to_bytes()),
@@ -537,10 +574,31 @@ fn without_token(answer: pb::track_response::Answer) -> pb::TrackResponse {
     }
 }
 
+/// A frame that is refused for `reason`, unless the server is at fault.
+fn refused(reason: Reason) -> impl Fn(Error) -> Refused {
+    move |error: Error| match error {
+        Error::Invalid { .. } | Error::Precondition(_) => Refused::Frame(reason, error.to_string()),
+        // Any other error is the server's and ends the stream.
+        other => Refused::Server(other),
+    }
+}
+
 /// Reason for a frame without an update.
 enum Refused {
     /// The frame is refused; the stream goes on.
     Frame(pb::TrackRefusalReason, String),
     /// The server is at fault; the stream ends.
     Server(Error),
+}
+
+/// The tracker refuses late and duplicate frames. A refused frame does not change the state.
+impl From<Refusal> for Refused {
+    fn from(refusal: Refusal) -> Self {
+        let reason = match &refusal {
+            Refusal::Late { .. } => Reason::Late,
+            Refusal::Duplicate { .. } => Reason::Duplicate,
+            Refusal::View(_) => Reason::View,
+        };
+        Self::Frame(reason, refusal.to_string())
+    }
 }

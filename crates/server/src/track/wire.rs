@@ -1,22 +1,15 @@
 //! Converts tracker updates to wire messages.
 
-use std::sync::Arc;
-
 use super::super::convert;
-use super::super::snapshot::ServedNavigator;
 use super::configuration::StreamFrames;
+use super::rooms::TrackedRoom;
 use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::{Pose, Twist, adjoint};
-use seese3_core::navigation::RetrievedFrame;
-use seese3_robot::tracking::{ANCHORS_TO_AGREE, PoseWithCovariance, Status, Update};
+use seese3_robot::tracking::{PoseWithCovariance, Status, Update};
 
 /// Converts an update. The session fills in `timestamp_ns`, `sequence`, `elapsed_ns` and
 /// `best_camera`.
-pub fn update(
-    update: &Update,
-    frames: &StreamFrames,
-    served: &[Arc<ServedNavigator>],
-) -> pb::TrackUpdate {
+pub fn update(update: &Update, frames: &StreamFrames, rooms: &[TrackedRoom]) -> pb::TrackUpdate {
     // As in REP-105, map_from_odom = map_from_camera · camera_from_odom is the drift correction. It
     // jumps when the pose is corrected, while odom stays continuous.
     let names = &frames.names;
@@ -26,15 +19,9 @@ pub fn update(
         .map_pose
         .map(|place| place.pose * odom_from_camera.inverse());
 
-    let (room, neighbour) = update.best_match;
-    let navigator = &served[room].navigator;
-    let retrieved = RetrievedFrame {
-        neighbour,
-        pose: navigator.room().poses()[neighbour.frame.row()],
-    };
-
     // Report the nearest frame only if the room is known; otherwise it would be misleading.
-    let known = update.room.map(|room| &served[room]);
+    let known = update.room.map(|room| &rooms[room]);
+    let best_match = update.best_match.filter(|_| known.is_some());
 
     let camera_from_base = frames.base_from_camera.map(|pose| pose.inverse());
     let base_in_map = update
@@ -64,8 +51,8 @@ pub fn update(
         status: status(update.status) as i32,
         reason: update.reason.clone(),
         out_of_distribution: update.out_of_distribution,
-        room: known.map(|served| convert::room_revision(served)),
-        best_match: known.map(|_| convert::retrieved_to_wire(&retrieved, navigator.room())),
+        room: known.map(|room| room.revision.clone()),
+        best_match: best_match.map(|(room, best)| rooms[room].retrieved(best)),
         match_used: update.match_used,
         match_surprise: update.surprise,
         elapsed_ns: 0,
@@ -73,11 +60,11 @@ pub fn update(
             .candidate
             .as_ref()
             .map(|candidate| pb::PlaceCandidate {
-                room: Some(convert::room_revision(&served[candidate.room])),
+                room: Some(rooms[candidate.room].revision.clone()),
                 map_from_camera: Some(pose(&candidate.map_pose.pose, &names.map, &names.camera)),
                 sequence: candidate.sequence,
                 agreed: candidate.agreeing_anchors,
-                needed: ANCHORS_TO_AGREE,
+                needed: update.anchors_needed,
             }),
         odom_from_base: camera_from_base.map(|camera_from_base| {
             let odom_from_base = odom_from_camera * camera_from_base;

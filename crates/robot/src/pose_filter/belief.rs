@@ -1,0 +1,275 @@
+//! A Gaussian on a camera's pose, its velocity and the lasting part of localization errors.
+
+use nalgebra::{Cholesky, Matrix6, SMatrix, SVector, Vector6};
+
+use super::FilterParameters;
+use crate::tracking::{MotionPrior, PoseWithCovariance};
+use seese3_core::geometry::{Pose, Twist, adjoint, exp, left_jacobian_inverse, log};
+
+const STATE: usize = 18;
+const JOINT: usize = 24;
+type StateMatrix = SMatrix<f64, STATE, STATE>;
+type JointMatrix = SMatrix<f64, JOINT, JOINT>;
+type Observed = SMatrix<f64, 6, JOINT>;
+
+/// Rows of the blocks of the state.
+const POSE: usize = 0;
+const VELOCITY: usize = 6;
+const LASTING: usize = 12;
+
+/// Rows of the blocks of [`Step`].
+const START: usize = 0;
+const MOTION: usize = 6;
+const END_VELOCITY: usize = 12;
+const END_LASTING: usize = 18;
+
+/// Pose, velocity and lasting error, with the covariance of their errors.
+///
+/// The pose error δ is in the body frame, true = pose · exp(δ), ordered (v, ω), in meters and
+/// radians. The lasting error is that of located poses, in standard deviations of each pose.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Belief {
+    /// `parent_from_camera`.
+    pub pose: Pose,
+    /// In the camera's body frame, meters and radians per second.
+    pub velocity: Twist,
+    /// Lasting error of located poses, in standard deviations.
+    pub lasting: Vector6<f64>,
+    /// Of (pose, velocity, lasting error); symmetric and positive definite.
+    #[cfg_attr(
+        feature = "serde",
+        serde(with = "seese3_core::matrices::upper_triangle")
+    )]
+    pub covariance: StateMatrix,
+}
+
+/// The origin of an odometry frame. Its deviation keeps covariances positive definite.
+pub fn origin() -> PoseWithCovariance {
+    PoseWithCovariance::known(Pose::identity(), 1e-6, 1e-6)
+}
+
+/// The belief over one step of time, while observations are added.
+///
+/// The error state is (initial pose, motion, final velocity, final lasting error). The motion's
+/// error is in the final body frame.
+pub struct Step {
+    /// The initial pose.
+    start: Pose,
+    /// Expected motion, final velocity and final lasting error, before any observation.
+    motion: Pose,
+    velocity: Vector6<f64>,
+    lasting: Vector6<f64>,
+    /// Estimated error state.
+    change: SVector<f64, JOINT>,
+    covariance: JointMatrix,
+}
+
+/// A linear observation of the error state.
+pub struct Observation {
+    residual: Vector6<f64>,
+    /// Derivative of the residual with respect to the error state.
+    derivative: Observed,
+    noise: Matrix6<f64>,
+}
+
+impl Belief {
+    /// A state with a known pose and unknown velocity: zero, with the covariance of the prior.
+    ///
+    /// `lasting_share` is the share of the pose's variance that is the lasting error of located
+    /// poses; 0 for a pose from another source.
+    pub fn at(place: &PoseWithCovariance, prior: &MotionPrior, lasting_share: f64) -> Self {
+        let mut covariance = StateMatrix::zeros();
+        let mut block = |row: usize, column: usize, of: &Matrix6<f64>| {
+            covariance.fixed_view_mut::<6, 6>(row, column).copy_from(of);
+        };
+
+        let scale = lasting_scale(place, lasting_share);
+        block(POSE, POSE, &place.covariance);
+        block(POSE, LASTING, &scale);
+        block(LASTING, POSE, &scale.transpose());
+        block(VELOCITY, VELOCITY, &prior.velocity_covariance());
+        block(LASTING, LASTING, &Matrix6::identity());
+
+        Self {
+            pose: place.pose,
+            velocity: Twist::default(),
+            lasting: Vector6::zeros(),
+            covariance,
+        }
+    }
+
+    /// A state at the origin of an odometry frame.
+    pub fn at_origin(prior: &MotionPrior) -> Self {
+        Self::at(&origin(), prior, 0.0)
+    }
+
+    /// The pose with its covariance.
+    pub fn place(&self) -> PoseWithCovariance {
+        PoseWithCovariance {
+            pose: self.pose,
+            covariance: self.covariance.fixed_view::<6, 6>(POSE, POSE).into_owned(),
+        }
+    }
+
+    /// Predicts the state some seconds later.
+    ///
+    /// The velocity is the Ornstein–Uhlenbeck process of `prior`, the lasting error one with the
+    /// correlation time of the parameters.
+    pub fn step(&self, prior: &MotionPrior, seconds: f64, parameters: &FilterParameters) -> Step {
+        let drift = prior.over(&self.velocity, seconds);
+        let lasts = (-seconds / parameters.lasting_s).exp();
+
+        let mut spread = SMatrix::<f64, JOINT, STATE>::zeros();
+        for axis in 0..6 {
+            let part = axis / 3;
+            spread[(START + axis, POSE + axis)] = 1.0;
+            spread[(MOTION + axis, VELOCITY + axis)] = drift.reach_s[part];
+            spread[(END_VELOCITY + axis, VELOCITY + axis)] = drift.left[part];
+            spread[(END_LASTING + axis, LASTING + axis)] = lasts;
+        }
+
+        let mut covariance = spread * self.covariance * spread.transpose();
+        let mut of_drift = covariance.fixed_view_mut::<12, 12>(MOTION, MOTION);
+        of_drift += drift.noise * parameters.abruptness;
+        for axis in END_LASTING..JOINT {
+            covariance[(axis, axis)] += 1.0 - lasts * lasts;
+        }
+
+        Step {
+            start: self.pose,
+            motion: exp(&drift.motion),
+            velocity: drift.velocity.to_vector(),
+            lasting: self.lasting * lasts,
+            change: SVector::zeros(),
+            covariance,
+        }
+    }
+}
+
+impl Step {
+    /// The observation of a located pose.
+    ///
+    /// Its error is L (√ρ · lasting error + √(1 − ρ) · noise) with L Lᵀ its covariance and the
+    /// lasting share ρ.
+    pub fn located(
+        &self,
+        located: &PoseWithCovariance,
+        parameters: &FilterParameters,
+    ) -> Observation {
+        let scale = lasting_scale(located, parameters.lasting_share);
+        let mut derivative = Observed::zeros();
+        let mut block = |column: usize, of: &Matrix6<f64>| {
+            derivative.fixed_view_mut::<6, 6>(0, column).copy_from(of);
+        };
+        block(START, &adjoint(&self.motion.inverse()));
+        block(MOTION, &Matrix6::identity());
+        block(END_LASTING, &-scale);
+
+        let expected = self.start * self.motion;
+        let difference = log(&expected.inv_mul(&located.pose)).to_vector();
+        Observation {
+            residual: difference + scale * self.lasting,
+            derivative,
+            noise: located.covariance * (1.0 - parameters.lasting_share),
+        }
+    }
+
+    /// The observation of the motion by another sensor, `start_from_end`.
+    pub fn moved(&self, motion: &PoseWithCovariance) -> Observation {
+        let mut derivative = Observed::zeros();
+        derivative
+            .fixed_view_mut::<6, 6>(0, MOTION)
+            .fill_with_identity();
+        Observation {
+            residual: log(&self.motion.inv_mul(&motion.pose)).to_vector(),
+            derivative,
+            noise: motion.covariance,
+        }
+    }
+
+    /// Squared Mahalanobis length of the innovation: χ² with six degrees of freedom if all
+    /// covariances are correct. Infinite if the sum of the covariances is not positive definite.
+    pub fn surprise(&self, observed: &Observation) -> f64 {
+        let innovation = self.innovation(observed);
+        let sum = Cholesky::new(self.innovation_covariance(observed));
+        sum.map_or(f64::INFINITY, |sum| innovation.dot(&sum.solve(&innovation)))
+    }
+
+    /// Kalman update; `factor` is on the covariance of the observation's noise. Nothing changes if the
+    /// sum of the covariances is not positive definite.
+    pub fn update(&mut self, observed: &Observation, factor: f64) {
+        let observed = Observation {
+            noise: observed.noise * factor,
+            ..*observed
+        };
+        let Some(sum) = Cholesky::new(self.innovation_covariance(&observed)) else {
+            return;
+        };
+        let gain = self.covariance * observed.derivative.transpose() * sum.inverse();
+        self.change += gain * self.innovation(&observed);
+
+        // Joseph's form: (I − K H) P (I − K H)ᵀ + K R Kᵀ.
+        let rest = JointMatrix::identity() - gain * observed.derivative;
+        self.covariance =
+            rest * self.covariance * rest.transpose() + gain * observed.noise * gain.transpose();
+    }
+
+    /// The motion of the step, `start_from_end`. Errors of located poses that last cancel in it.
+    pub fn motion(&self) -> PoseWithCovariance {
+        let error = self.change.fixed_rows::<6>(MOTION).into_owned();
+        let covariance = self.covariance.fixed_view::<6, 6>(MOTION, MOTION);
+        PoseWithCovariance {
+            pose: self.motion * exp(&Twist::from_vector(&error)),
+            covariance: covariance.into_owned(),
+        }
+    }
+
+    /// The state after the step.
+    pub fn end(&self) -> Belief {
+        let part = |at: usize| self.change.fixed_rows::<6>(at).into_owned();
+        let start = self.start * exp(&Twist::from_vector(&part(START)));
+        let motion = self.motion().pose;
+
+        // The final pose error is the initial one in the new body frame, plus the motion's.
+        let mut merged = SMatrix::<f64, STATE, JOINT>::zeros();
+        merged
+            .fixed_view_mut::<6, 6>(POSE, START)
+            .copy_from(&adjoint(&motion.inverse()));
+        for axis in 0..6 {
+            merged[(POSE + axis, MOTION + axis)] = 1.0;
+            merged[(VELOCITY + axis, END_VELOCITY + axis)] = 1.0;
+            merged[(LASTING + axis, END_LASTING + axis)] = 1.0;
+        }
+        let covariance = merged * self.covariance * merged.transpose();
+
+        Belief {
+            pose: start * motion,
+            velocity: Twist::from_vector(&(self.velocity + part(END_VELOCITY))),
+            lasting: self.lasting + part(END_LASTING),
+            covariance: (covariance + covariance.transpose()) * 0.5,
+        }
+    }
+
+    fn innovation(&self, observed: &Observation) -> Vector6<f64> {
+        observed.residual - observed.derivative * self.change
+    }
+
+    fn innovation_covariance(&self, observed: &Observation) -> Matrix6<f64> {
+        let of_state = observed.derivative * self.covariance * observed.derivative.transpose();
+        of_state + observed.noise
+    }
+}
+
+/// Covariance of the error of the twist ξ of a motion, exp(ξ): J_r⁻¹(ξ) Σ J_r⁻ᵀ(ξ).
+pub fn twist_covariance(motion: &PoseWithCovariance) -> Matrix6<f64> {
+    let inverse = left_jacobian_inverse(&log(&motion.pose).reversed());
+    let covariance = inverse * motion.covariance * inverse.transpose();
+    (covariance + covariance.transpose()) * 0.5
+}
+
+/// √ρ L, with L Lᵀ the covariance of a located pose; zero if that is not positive definite.
+fn lasting_scale(located: &PoseWithCovariance, lasting_share: f64) -> Matrix6<f64> {
+    let root = Cholesky::new(located.covariance).map_or_else(Matrix6::zeros, |root| root.unpack());
+    root * lasting_share.sqrt()
+}

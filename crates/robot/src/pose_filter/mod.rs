@@ -1,0 +1,285 @@
+//! A filter on a camera's pose in a map: located poses correct what the motion prior predicts.
+//!
+//! Start reading at [`PoseFilter::observe`]. It needs no adapter: a view's pose is located by its
+//! keypoints, see [`crate::matched_views`].
+//!
+//! - The filter is stateless: all data of a stream are in its [`FilterState`].
+//! - Errors of located poses are a lasting part, which several views of one place share, and an
+//!   independent part; see [`Belief`]. The filter does not average the lasting part out.
+//! - A located pose that contradicts the belief is not used. Two in a row that agree replace it.
+//! - `odom_from_camera` composes the motions of the steps, in which lasting errors cancel. It is
+//!   continuous and drifts.
+
+mod belief;
+mod state;
+mod status;
+
+pub use belief::Belief;
+pub use state::{FilterCandidate, FilterState, KeyframeMark, LastView, ViewObservation};
+
+use crate::tracking::{MatchedPose, MotionPrior, PoseWithCovariance, Refusal, Update, extent_m};
+use belief::{Step, twist_covariance};
+use seese3_core::geometry::log;
+use seese3_core::room::{FrameId, Room};
+
+/// Parameters of a filter.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FilterParameters {
+    /// Share of the variance of a located pose that lasts from view to view, 0 to 1.
+    pub lasting_share: f64,
+    /// Correlation time of that part, seconds.
+    pub lasting_s: f64,
+    /// Factor on the process noise of the motion prior: a person turns and stops more abruptly than
+    /// a Gaussian process.
+    pub abruptness: f64,
+    /// Squared Mahalanobis length of an innovation above which a located pose counts less: its
+    /// covariance grows with the square of the excess.
+    pub gate: f64,
+    /// The same above which it is not used.
+    pub max_surprise: f64,
+    /// Number of consecutive located poses that must agree to start the tracking, or to replace a
+    /// pose that they contradict.
+    pub views_to_agree: u32,
+    /// Longest time between two such poses, seconds.
+    pub max_candidate_s: f64,
+    /// Time without a located view after which a stream is DEGRADED, seconds.
+    pub max_unlocated_s: f64,
+    /// Number of consecutive identical images after which a stream is DEGRADED.
+    pub max_unchanged_frames: u32,
+    /// Interval of keyframes, in frames; at least 1.
+    pub keyframe_frames: u32,
+    /// Whether located poses are used.
+    pub fuse: bool,
+}
+
+impl Default for FilterParameters {
+    fn default() -> Self {
+        Self {
+            lasting_share: 0.7,
+            lasting_s: 0.3,
+            abruptness: 8.0,
+            // The 99 % quantile of χ² with six degrees of freedom, and four times that.
+            gate: 16.81,
+            max_surprise: 67.24,
+            views_to_agree: 2,
+            max_candidate_s: 1.0,
+            max_unlocated_s: 0.35,
+            max_unchanged_frames: 5,
+            keyframe_frames: 30,
+            fuse: true,
+        }
+    }
+}
+
+/// A mapped room, as far as a filter needs it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FilterRoom {
+    /// Velocity statistics of the camera that mapped the room.
+    pub motion_prior: MotionPrior,
+    /// Diagonal of the bounding box of the mapped camera positions, meters.
+    pub extent_m: f64,
+}
+
+impl FilterRoom {
+    /// A room with its mapped frames, in order.
+    pub fn of(room: &Room, mapped: &[FrameId]) -> Self {
+        Self {
+            motion_prior: MotionPrior::of_path(room, mapped),
+            extent_m: extent_m(room, mapped),
+        }
+    }
+}
+
+/// Tracks cameras in one or more rooms.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PoseFilter {
+    rooms: Vec<FilterRoom>,
+    parameters: FilterParameters,
+}
+
+/// What a located pose did.
+enum Correction {
+    /// It was not used: there is none, or it supports a candidate.
+    Unused,
+    /// It corrected the step.
+    Applied,
+    /// It and earlier ones agree on this belief, which replaces that of the step.
+    Replaced(Belief),
+}
+
+impl PoseFilter {
+    /// A filter for streams in these rooms; `None` without a room.
+    pub fn new(rooms: Vec<FilterRoom>, parameters: FilterParameters) -> Option<Self> {
+        let is_usable = !rooms.is_empty();
+        is_usable.then_some(Self { rooms, parameters })
+    }
+
+    /// The parameters.
+    pub fn parameters(&self) -> &FilterParameters {
+        &self.parameters
+    }
+
+    /// The state of a new stream. `initial` is a known pose, `world_from_camera`, in the only room.
+    pub fn start(&self, initial: Option<&PoseWithCovariance>) -> FilterState {
+        let mut state = FilterState::in_room((self.rooms.len() == 1).then_some(0));
+        if let Some(pose) = initial {
+            self.set_pose(&mut state, pose);
+        }
+        state
+    }
+
+    /// Sets the pose of the camera at the last frame, `world_from_camera`, in the stream's room.
+    /// Nothing changes if the room is not known.
+    pub fn set_pose(&self, state: &mut FilterState, pose: &PoseWithCovariance) {
+        let Some(room) = state.room else {
+            return;
+        };
+        state.belief = Some(Belief::at(pose, &self.rooms[room].motion_prior, 0.0));
+        state.is_placed = true;
+        state.candidate = None;
+        state.located_ns = state.last.map(|last| last.time_ns);
+    }
+
+    /// Adds a frame to the stream.
+    ///
+    /// # Errors
+    /// [`Refusal`] if the frame is not newer than the last one. The state is then unchanged.
+    pub fn observe(
+        &self,
+        state: &mut FilterState,
+        frame: &ViewObservation,
+    ) -> Result<Update, Refusal> {
+        let seconds = state.seconds_to(frame)?;
+        let is_first = state.last.is_none();
+        state.advance(frame);
+
+        // 1. Predict. The room's prior holds; before the room is known, that of the first one.
+        let prior = &self.rooms[state.room.unwrap_or(0)].motion_prior;
+        let belief = state.belief.unwrap_or_else(|| Belief::at_origin(prior));
+        let mut step = belief.step(prior, seconds, &self.parameters);
+
+        // 2. Correct. An identical image holds nothing new.
+        let is_new = self.parameters.fuse && state.unchanged_frames == 0;
+        let matched = frame.matched.filter(|_| is_new);
+        let surprise = matched.and_then(|matched| self.surprise(state, &step, &matched));
+        let correction = match &matched {
+            Some(matched) => self.correct(state, &mut step, frame, matched, surprise),
+            None => Correction::Unused,
+        };
+        let is_used = !matches!(correction, Correction::Unused);
+
+        // 3. Compose the odometry from the motions of the steps.
+        let motion = step.motion();
+        state.odom = state.odom.composed(&motion);
+        let keyframe = state.keyframe_with(frame, &motion, self.parameters.keyframe_frames);
+        let belief = match correction {
+            Correction::Replaced(belief) => belief,
+            Correction::Unused | Correction::Applied => step.end(),
+        };
+        state.belief = Some(belief);
+
+        // 4. Report.
+        let (status, reason) = self.status(state, frame);
+        Ok(Update {
+            motion: log(&keyframe.since.pose),
+            motion_covariance: twist_covariance(&keyframe.since),
+            keyframe_sequence: keyframe.sequence,
+            is_keyframe: state
+                .keyframe
+                .is_some_and(|now| now.sequence == frame.sequence),
+            odom: state.odom,
+            map_pose: state.is_placed.then(|| belief.place()),
+            velocity: (!is_first).then_some(belief.velocity),
+            status,
+            reason,
+            out_of_distribution: frame.novelty,
+            room: state.room,
+            best_match: matched.map(|matched| (matched.room, matched.best_match())),
+            best_camera: None,
+            match_used: is_used,
+            surprise,
+            candidate: state.candidate.as_ref().map(FilterCandidate::reported),
+            anchors_needed: self.parameters.views_to_agree,
+        })
+    }
+
+    /// Corrects the step by a located pose.
+    ///
+    /// Without a belief, or if the pose contradicts it, the pose supports a candidate. So it does if
+    /// the belief is uncertain: almost any pose agrees with it.
+    fn correct(
+        &self,
+        state: &mut FilterState,
+        step: &mut Step,
+        frame: &ViewObservation,
+        matched: &MatchedPose,
+        surprise: Option<f64>,
+    ) -> Correction {
+        let parameters = &self.parameters;
+        let earlier = state.candidate.take();
+
+        let is_certain = step.end().place().tells_a_place();
+        let surprise = surprise.filter(|_| is_certain).unwrap_or(f64::INFINITY);
+        if surprise <= parameters.max_surprise {
+            // Errors have heavier tails than a Gaussian.
+            let factor = (surprise / parameters.gate).max(1.0).powi(2);
+            let observed = step.located(&matched.pose, parameters);
+            step.update(&observed, factor);
+            state.located_ns = Some(frame.time_ns);
+            return Correction::Applied;
+        }
+
+        let (belief, agreeing) = earlier
+            .and_then(|candidate| self.supported(&candidate, frame, matched))
+            .unwrap_or_else(|| {
+                let prior = &self.rooms[matched.room].motion_prior;
+                let belief = Belief::at(&matched.pose, prior, parameters.lasting_share);
+                (belief, 1)
+            });
+        if agreeing >= parameters.views_to_agree {
+            state.room = Some(matched.room);
+            state.is_placed = true;
+            state.located_ns = Some(frame.time_ns);
+            return Correction::Replaced(belief);
+        }
+
+        state.candidate = Some(FilterCandidate {
+            room: matched.room,
+            time_ns: frame.time_ns,
+            sequence: frame.sequence,
+            belief,
+            agreeing,
+        });
+        Correction::Unused
+    }
+
+    /// The belief of a candidate that a later pose agrees with, and how many do.
+    fn supported(
+        &self,
+        candidate: &FilterCandidate,
+        frame: &ViewObservation,
+        matched: &MatchedPose,
+    ) -> Option<(Belief, u32)> {
+        let parameters = &self.parameters;
+        let seconds = frame.time_ns.abs_diff(candidate.time_ns) as f64 * 1e-9;
+        if candidate.room != matched.room || seconds > parameters.max_candidate_s {
+            return None;
+        }
+
+        let prior = &self.rooms[candidate.room].motion_prior;
+        let mut step = candidate.belief.step(prior, seconds, parameters);
+        let observed = step.located(&matched.pose, parameters);
+        let agrees = step.surprise(&observed) <= parameters.gate;
+        agrees.then(|| {
+            step.update(&observed, 1.0);
+            (step.end(), candidate.agreeing + 1)
+        })
+    }
+
+    /// Squared Mahalanobis length of the innovation of a located pose, if there is a belief in its
+    /// room.
+    fn surprise(&self, state: &FilterState, step: &Step, matched: &MatchedPose) -> Option<f64> {
+        let is_here = state.is_placed && state.room == Some(matched.room);
+        is_here.then(|| step.surprise(&step.located(&matched.pose, &self.parameters)))
+    }
+}

@@ -1,0 +1,182 @@
+//! Input and state of a filter.
+
+use super::Belief;
+use super::belief::origin;
+use crate::tracking::{Candidate, MatchedPose, PoseWithCovariance, Refusal};
+
+/// One frame of a stream.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ViewObservation {
+    /// Timestamp, nanoseconds on the sensor's clock.
+    pub time_ns: i64,
+    /// Sequence number set by the sender.
+    pub sequence: u64,
+    /// The pose of the view, if its keypoints locate it.
+    pub matched: Option<MatchedPose>,
+    /// How unlike the view is to the map, relative to the limit; infinite if unknown.
+    pub novelty: f64,
+    /// Why the keypoints do not locate the view; empty if they do.
+    pub unlocated: String,
+    /// Hash of the view's keypoints: equal for identical images. `None` without keypoints.
+    pub fingerprint: Option<u64>,
+}
+
+/// Complete state of a stream.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct FilterState {
+    /// The only room, or the one in which the camera was located; an index of the filter's rooms.
+    pub room: Option<usize>,
+    /// The last frame.
+    pub last: Option<LastView>,
+    /// The belief in the room if `is_placed`, else in an odometry frame.
+    pub belief: Option<Belief>,
+    /// Whether the belief is in the room.
+    pub is_placed: bool,
+    /// `odom_from_camera`.
+    pub odom: PoseWithCovariance,
+    /// The keyframe of reported motions.
+    pub keyframe: Option<KeyframeMark>,
+    /// A belief that a located pose supports, but not enough of them.
+    pub candidate: Option<FilterCandidate>,
+    /// Time of the last frame whose located pose was used, nanoseconds on the sensor's clock.
+    pub located_ns: Option<i64>,
+    /// Number of consecutive frames with the same image as the one before.
+    pub unchanged_frames: u32,
+}
+
+/// The last frame of a stream.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct LastView {
+    /// Timestamp, nanoseconds on the sensor's clock.
+    pub time_ns: i64,
+    /// Sequence number.
+    pub sequence: u64,
+    /// Hash of the view's keypoints; `None` without keypoints.
+    pub fingerprint: Option<u64>,
+}
+
+/// The keyframe of reported motions.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct KeyframeMark {
+    /// Sequence number.
+    pub sequence: u64,
+    /// The motion since.
+    pub since: PoseWithCovariance,
+}
+
+/// A belief that located poses support, but not enough of them.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct FilterCandidate {
+    /// The room, an index of the filter's rooms.
+    pub room: usize,
+    /// Timestamp of the newest supporting frame, nanoseconds on the sensor's clock.
+    pub time_ns: i64,
+    /// Sequence number of that frame.
+    pub sequence: u64,
+    /// The belief at that frame.
+    pub belief: Belief,
+    /// Number of consecutive located poses that agree.
+    pub agreeing: u32,
+}
+
+impl FilterState {
+    /// The state of a new stream.
+    pub(super) fn in_room(room: Option<usize>) -> Self {
+        Self {
+            room,
+            last: None,
+            belief: None,
+            is_placed: false,
+            odom: origin(),
+            keyframe: None,
+            candidate: None,
+            located_ns: None,
+            unchanged_frames: 0,
+        }
+    }
+
+    /// Seconds from the last frame to this one; 0 for the first.
+    ///
+    /// # Errors
+    /// [`Refusal`] if the frame is not newer.
+    pub(super) fn seconds_to(&self, frame: &ViewObservation) -> Result<f64, Refusal> {
+        let Some(last) = self.last else {
+            return Ok(0.0);
+        };
+        if frame.time_ns <= last.time_ns {
+            return Err(Refusal::Late {
+                time_ns: frame.time_ns,
+                last_ns: last.time_ns,
+            });
+        }
+        if frame.sequence <= last.sequence {
+            return Err(Refusal::Duplicate {
+                sequence: frame.sequence,
+                last: last.sequence,
+            });
+        }
+        Ok(frame.time_ns.abs_diff(last.time_ns) as f64 * 1e-9)
+    }
+
+    /// Makes a frame the last one, and counts identical images.
+    pub(super) fn advance(&mut self, frame: &ViewObservation) {
+        let is_unchanged = self.last.is_some_and(|last| {
+            last.fingerprint.is_some() && last.fingerprint == frame.fingerprint
+        });
+        self.unchanged_frames = if is_unchanged {
+            self.unchanged_frames.saturating_add(1)
+        } else {
+            0
+        };
+        self.last = Some(LastView {
+            time_ns: frame.time_ns,
+            sequence: frame.sequence,
+            fingerprint: frame.fingerprint,
+        });
+
+        // A pose that was set before the first frame holds at this one.
+        if self.is_placed {
+            self.located_ns.get_or_insert(frame.time_ns);
+        }
+    }
+
+    /// The keyframe of this frame, with the motion since. The frame itself becomes the keyframe of
+    /// later ones after `interval` frames.
+    pub(super) fn keyframe_with(
+        &mut self,
+        frame: &ViewObservation,
+        motion: &PoseWithCovariance,
+        interval: u32,
+    ) -> KeyframeMark {
+        let this = KeyframeMark {
+            sequence: frame.sequence,
+            since: origin(),
+        };
+        let reported = self.keyframe.map_or(this, |keyframe| KeyframeMark {
+            since: keyframe.since.composed(motion),
+            ..keyframe
+        });
+
+        let is_due = frame.sequence - reported.sequence >= u64::from(interval);
+        self.keyframe = Some(if is_due { this } else { reported });
+        reported
+    }
+}
+
+impl FilterCandidate {
+    /// The candidate as an update reports it.
+    pub(super) fn reported(&self) -> Candidate {
+        Candidate {
+            room: self.room,
+            time_ns: self.time_ns,
+            sequence: self.sequence,
+            latent: None,
+            map_pose: self.belief.place(),
+            agreeing_anchors: self.agreeing,
+        }
+    }
+}

@@ -1,0 +1,252 @@
+//! The filter of located poses.
+
+use nalgebra::{Matrix6, Vector3};
+
+use seese3_core::geometry::{Pose, PoseError, Twist, body_twist, exp};
+use seese3_core::room::FrameId;
+use seese3_robot::pose_filter::{
+    Belief, FilterParameters, FilterRoom, FilterState, PoseFilter, ViewObservation,
+};
+use seese3_robot::tracking::{
+    MatchedPose, MotionPrior, PoseWithCovariance, Refusal, Status, Update,
+};
+
+const PERIOD_NS: i64 = 33_333_333;
+
+fn parameters(lasting_share: f64, lasting_s: f64) -> FilterParameters {
+    FilterParameters {
+        lasting_share,
+        lasting_s,
+        ..FilterParameters::default()
+    }
+}
+
+fn filter() -> PoseFilter {
+    let room = FilterRoom {
+        motion_prior: MotionPrior::assumed(),
+        extent_m: 3.0,
+    };
+    PoseFilter::new(vec![room], FilterParameters::default()).unwrap()
+}
+
+fn located(pose: Pose, deviation: f64) -> PoseWithCovariance {
+    PoseWithCovariance::known(pose, deviation, deviation)
+}
+
+fn view(number: u64, pose: Option<Pose>) -> ViewObservation {
+    ViewObservation {
+        time_ns: number as i64 * PERIOD_NS,
+        sequence: number,
+        matched: pose.map(|pose| MatchedPose {
+            room: 0,
+            pose: located(pose, 0.005),
+            novelty: 0.5,
+            best_frame: FrameId(0),
+        }),
+        novelty: if pose.is_some() { 0.5 } else { 2.0 },
+        unlocated: if pose.is_some() {
+            String::new()
+        } else {
+            "too few keypoints".to_owned()
+        },
+        fingerprint: Some(number),
+    }
+}
+
+/// A path at 0.3 m/s that also turns.
+fn path(number: u64) -> Pose {
+    let twist = Twist {
+        linear: Vector3::new(0.3, 0.0, 0.1),
+        angular: Vector3::new(0.0, 0.2, 0.0),
+    };
+    exp(&twist.scaled(number as f64 * PERIOD_NS as f64 * 1e-9))
+}
+
+fn error_m(update: &Update, pose: &Pose) -> f64 {
+    PoseError::between(&update.map_pose.unwrap().pose, pose).translation_m
+}
+
+/// Oracle: the definition of a lasting error. Two poses of a camera at rest, located with the same
+/// error, tell its place no better than one; with independent errors, the variance halves.
+#[test]
+fn lasting_errors_are_not_averaged_out() {
+    let prior = MotionPrior::assumed();
+    let pose = located(Pose::identity(), 0.01);
+    let variance_after_two = |share: f64| {
+        let parameters = parameters(share, 1e9);
+        let mut step = Belief::at(&pose, &prior, share).step(&prior, 0.0, &parameters);
+        step.update(&step.located(&pose, &parameters), 1.0);
+        step.end().place().covariance[(0, 0)]
+    };
+
+    assert!((variance_after_two(0.0) / 0.5e-4 - 1.0).abs() < 1e-9);
+    assert!((variance_after_two(1.0 - 1e-9) / 1e-4 - 1.0).abs() < 1e-6);
+    // A half that lasts and a half that is averaged.
+    assert!((variance_after_two(0.5) / 0.75e-4 - 1.0).abs() < 1e-9);
+}
+
+/// Oracle: the same definition. A lasting error is that of both ends of a motion, so it cancels.
+#[test]
+fn lasting_errors_cancel_in_a_motion() {
+    let prior = MotionPrior::assumed();
+    let parameters = parameters(1.0 - 1e-9, 1e9);
+    let error = exp(&Twist {
+        linear: Vector3::new(0.02, 0.0, 0.0),
+        angular: Vector3::zeros(),
+    });
+    let (start, end) = (Pose::identity(), Pose::translation(0.0, 0.0, 0.05));
+
+    let belief = Belief::at(
+        &located(start * error, 0.02),
+        &prior,
+        parameters.lasting_share,
+    );
+    let mut step = belief.step(&prior, 0.1, &parameters);
+    step.update(&step.located(&located(end * error, 0.02), &parameters), 1.0);
+    let motion = step.motion();
+    assert!(PoseError::between(&motion.pose, &end).translation_m < 1e-5);
+    assert!(motion.covariance.diagonal().max() < 1e-8);
+    assert!(step.end().place().covariance[(0, 0)] > 0.9 * 4e-4);
+}
+
+/// Oracle: without observations, the closed form of the prior (tested in `pose_velocity.rs`): of a
+/// known pose and velocity variance σ², the displacement after t has at least the variance
+/// (σ τ (1 − e^(−t/τ)))².
+#[test]
+fn an_exact_motion_of_another_sensor_replaces_the_prior() {
+    let prior = MotionPrior::assumed();
+    let parameters = FilterParameters::default();
+    let belief = Belief::at(&located(Pose::identity(), 0.1), &prior, 0.0);
+    let mut step = belief.step(&prior, 0.1, &parameters);
+    let reach = 0.5 * 0.5 * (1.0 - (-0.1_f64 / 0.5).exp());
+    assert!(step.motion().covariance[(0, 0)] > reach * reach);
+
+    let motion = PoseWithCovariance {
+        pose: path(9),
+        covariance: Matrix6::identity() * 1e-14,
+    };
+    step.update(&step.moved(&motion), 1.0);
+    assert!(PoseError::between(&step.end().pose, &path(9)).translation_m < 1e-6);
+    let variance = step.end().place().covariance[(0, 0)];
+    assert!((variance / 1e-2 - 1.0).abs() < 0.1, "{variance}");
+}
+
+/// Oracle: the contract: two located views that agree start the tracking, at the true pose, with the
+/// true velocity and a continuous odometry.
+#[test]
+fn two_located_views_start_the_tracking() {
+    let filter = filter();
+    let mut state = filter.start(None);
+    let mut observe =
+        |state: &mut FilterState, number, pose| filter.observe(state, &view(number, pose)).unwrap();
+
+    assert_eq!(observe(&mut state, 0, None).status, Status::Lost);
+    let first = observe(&mut state, 1, Some(path(1)));
+    assert_eq!(first.status, Status::Relocalizing);
+    assert!(first.map_pose.is_none() && first.candidate.is_some());
+
+    let mut odom = first.odom.pose;
+    for number in 2..90 {
+        let update = observe(&mut state, number, Some(path(number)));
+        assert_eq!(update.status, Status::Tracking, "{}", update.reason);
+        assert!(error_m(&update, &path(number)) < 0.01);
+        let step = PoseError::between(&odom, &update.odom.pose).translation_m;
+        assert!(step < 0.03, "{step}");
+        odom = update.odom.pose;
+    }
+    let update = observe(&mut state, 90, Some(path(90)));
+    let velocity = update.velocity.unwrap();
+    let truth = body_twist(&path(89), &path(90)).scaled(1e9 / PERIOD_NS as f64);
+    assert!(
+        (velocity.linear - truth.linear).norm() < 0.03,
+        "{velocity:?}"
+    );
+
+    // Unlocated views: the pose goes on for a while, then the status says so.
+    let number = 91..=110;
+    let statuses: Vec<Status> = number
+        .map(|number| observe(&mut state, number, None).status)
+        .collect();
+    assert_eq!(statuses[0], Status::Tracking);
+    assert_eq!(statuses[19], Status::Degraded);
+}
+
+/// Oracle: the contract: one pose elsewhere is an outlier; two that agree are a camera that was
+/// carried away.
+#[test]
+fn one_outlier_is_ignored_and_two_that_agree_are_believed() {
+    let filter = filter();
+    let mut state = filter.start(None);
+    for number in 0..10 {
+        filter
+            .observe(&mut state, &view(number, Some(path(number))))
+            .unwrap();
+    }
+
+    let elsewhere = Pose::translation(1.5, 0.0, 0.0);
+    let outlier = filter
+        .observe(&mut state, &view(10, Some(elsewhere)))
+        .unwrap();
+    assert_eq!(outlier.status, Status::Degraded);
+    assert!(!outlier.match_used && error_m(&outlier, &path(10)) < 0.03);
+    let back = filter
+        .observe(&mut state, &view(11, Some(path(11))))
+        .unwrap();
+    assert!(back.status == Status::Tracking && back.match_used);
+
+    filter
+        .observe(&mut state, &view(12, Some(elsewhere)))
+        .unwrap();
+    let carried = filter
+        .observe(&mut state, &view(13, Some(elsewhere)))
+        .unwrap();
+    assert_eq!(carried.status, Status::Tracking);
+    assert!(error_m(&carried, &elsewhere) < 0.01);
+}
+
+/// Oracle: the contract: an image that repeats holds nothing new; six in a row are a frozen camera. A
+/// frame that is not newer is refused and changes nothing.
+#[test]
+fn frozen_images_and_late_frames_are_noticed() {
+    let filter = filter();
+    let mut state = filter.start(None);
+    for number in 0..5 {
+        filter
+            .observe(&mut state, &view(number, Some(path(number))))
+            .unwrap();
+    }
+
+    let frozen = |number| ViewObservation {
+        fingerprint: Some(4),
+        ..view(number, Some(path(4)))
+    };
+    let statuses: Vec<Status> = (5..12)
+        .map(|number| filter.observe(&mut state, &frozen(number)).unwrap().status)
+        .collect();
+    assert_eq!(statuses[3], Status::Tracking);
+    assert_eq!(statuses[4], Status::Degraded);
+
+    let before = state.clone();
+    let late = filter.observe(&mut state, &view(3, None));
+    assert!(matches!(late, Err(Refusal::Late { .. })));
+    let duplicate = ViewObservation {
+        sequence: 3,
+        ..view(20, None)
+    };
+    let duplicate = filter.observe(&mut state, &duplicate);
+    assert!(matches!(duplicate, Err(Refusal::Duplicate { .. })));
+    assert_eq!(state, before);
+}
+
+/// Oracle: the contract: a pose that the client sets is believed until views contradict it.
+#[test]
+fn a_given_pose_starts_the_tracking() {
+    let filter = filter();
+    let mut state = filter.start(Some(&located(path(0), 0.05)));
+    let update = filter.observe(&mut state, &view(0, None)).unwrap();
+    assert_eq!(update.status, Status::Tracking);
+    assert!(error_m(&update, &path(0)) < 1e-9);
+
+    let update = filter.observe(&mut state, &view(1, Some(path(1)))).unwrap();
+    assert!(update.match_used && error_m(&update, &path(1)) < 0.01);
+}

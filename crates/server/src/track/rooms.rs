@@ -1,0 +1,135 @@
+//! The rooms of a Track stream.
+
+use std::sync::Arc;
+
+use super::super::Error;
+use super::super::convert;
+use super::super::localization::asked_rooms;
+use super::super::relocalization::can_track;
+use super::super::snapshot::{
+    ServedKeypoints, ServedNavigator, ServedRoom, Snapshot, frames_content,
+};
+use seese3_client::proto::v1 as pb;
+use seese3_core::navigation::RetrievedFrame;
+use seese3_core::room::Room;
+use seese3_store::StoredAdapter;
+
+/// A room in which a stream tracks its camera.
+#[derive(Clone)]
+pub struct TrackedRoom {
+    /// The room's revision.
+    pub revision: pb::Revision,
+    pub room: Arc<Room>,
+    /// The keypoints of the room, if it has any.
+    pub keypoints: Option<ServedKeypoints>,
+    /// The room under the stream's adapter; `None` for a stream without an adapter.
+    pub served: Option<Arc<ServedNavigator>>,
+}
+
+impl TrackedRoom {
+    /// A room under an adapter.
+    pub fn under(served: Arc<ServedNavigator>) -> Self {
+        Self {
+            revision: convert::room_revision(&served),
+            room: served.navigator.room().clone(),
+            keypoints: served.keypoints.clone(),
+            served: Some(served),
+        }
+    }
+
+    /// A room without an adapter. Blocks while the room is loaded.
+    ///
+    /// # Errors
+    /// As [`ServedRoom::load`].
+    fn of(served: &ServedRoom) -> Result<Self, Error> {
+        let loaded = served.load()?;
+        Ok(Self {
+            revision: super::super::localization::room_to_wire(served),
+            room: loaded.room.clone(),
+            keypoints: loaded.keypoints.clone(),
+            served: None,
+        })
+    }
+
+    /// The adapter of the stream.
+    pub fn adapter(&self) -> Option<&Arc<StoredAdapter>> {
+        self.served.as_ref().map(|served| &served.adapter)
+    }
+
+    /// SHA-256 of the adapter; empty without one.
+    pub fn adapter_content(&self) -> &[u8] {
+        let served = self.served.as_ref();
+        served.map_or(&[], |served| &served.content.adapter)
+    }
+
+    /// SHA-256 of the first `frame_count` frames, see [`frames_content`]; `None` if the room has
+    /// fewer.
+    pub fn frames_content(&self, frame_count: usize) -> Option<[u8; 32]> {
+        if frame_count > self.room.frame_count() {
+            return None;
+        }
+
+        Some(match &self.served {
+            Some(served) if frame_count == self.room.frame_count() => served.content.frames,
+            Some(served) => {
+                frames_content(&self.room, Some(served.navigator.latents()), frame_count)
+            }
+            None => frames_content(&self.room, None, frame_count),
+        })
+    }
+
+    /// A stored frame as a wire message.
+    pub fn retrieved(&self, neighbour: seese3_core::index::Neighbour) -> pb::RetrievedFrame {
+        let retrieved = RetrievedFrame {
+            neighbour,
+            pose: self.room.poses()[neighbour.frame.row()],
+        };
+        convert::retrieved_to_wire(&retrieved, &self.room)
+    }
+}
+
+/// The rooms of a stream that tracks by keypoints alone; `None` if an adapter is to be used: the
+/// configuration names one, an adapter can track in these rooms, or not all of them have keypoints
+/// that this server can detect.
+///
+/// # Errors
+/// [`Error::NotFound`] or [`Error::Invalid`] on the rooms; [`Error::Precondition`] if a named room
+/// cannot be loaded.
+pub fn rooms_with_keypoints(
+    snapshot: &Snapshot,
+    config: &pb::TrackConfig,
+) -> Result<Option<Vec<TrackedRoom>>, Error> {
+    let named = match config.room.as_str() {
+        "" => config.rooms.clone(),
+        room => vec![room.to_owned()],
+    };
+    let is_both = !config.room.is_empty() && !config.rooms.is_empty();
+    if is_both || !config.adapter.is_empty() || can_track(snapshot, &named) {
+        return Ok(None);
+    }
+
+    let asked = asked_rooms(snapshot, &named);
+    let asked = asked.map_err(|error| match error {
+        Error::NotFound { .. } if !config.room.is_empty() => error.named("room"),
+        other => other,
+    })?;
+    let is_usable = |room: &&Arc<ServedRoom>| {
+        let source = room.summary.keypoints.as_ref();
+        source.is_some_and(|source| snapshot.keypoint_encoder(source).is_some())
+    };
+    let usable: Vec<&Arc<ServedRoom>> = asked.iter().filter(is_usable).collect();
+    if usable.is_empty() || (!named.is_empty() && usable.len() < asked.len()) {
+        return Ok(None);
+    }
+
+    let mut rooms = Vec::new();
+    for room in usable {
+        match TrackedRoom::of(room) {
+            Ok(room) => rooms.push(room),
+            // A search of all rooms skips those that cannot be loaded.
+            Err(Error::Precondition(_)) if named.is_empty() => {}
+            Err(error) => return Err(error),
+        }
+    }
+    Ok((!rooms.is_empty()).then_some(rooms))
+}
