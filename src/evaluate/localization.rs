@@ -6,7 +6,6 @@ use std::time::Instant;
 use anyhow::{Context, bail};
 use clap::Args;
 
-use seese3_core::cancel::Cancellation;
 use seese3_core::eval::has_seen;
 use seese3_core::features::Features;
 use seese3_core::geometry::CameraIntrinsics;
@@ -23,18 +22,15 @@ use seese3_lab::report::{
 };
 use seese3_robot::matched_views::TrialRecording;
 
-use super::super::encoder::RuntimeOptions;
 use super::super::fit::fitting_bar;
 use super::super::named::one_of;
 use super::super::output::{JsonOutput, say};
 use super::super::progress::bar;
+use super::keypoint_views::KeypointViews;
 use super::peer::{Peer, PeerTask};
-use super::room_images::{RoomImages, keypoint_model};
-use seese3_encoder::{Encoded, Encoder, OnBadImage, Task, encode_room};
-use seese3_store::{RoomKeypoints, Store, StoredRoom};
+use super::room_images::RoomImages;
+use seese3_store::{Store, StoredRoom};
 
-/// Frames per run of the model.
-const BATCH: usize = 8;
 /// Width of images that are drawn for the peer, pixels.
 const PEER_WIDTH: usize = 640;
 
@@ -67,12 +63,6 @@ pub struct Localization {
     /// Choose the mapped frames by a hold-out instead of --map-every; matched views only
     #[arg(long, value_parser = one_of::<HoldOut>(), conflicts_with_all = ["map_every", "map_blocks", "adapter", "fit"])]
     hold_out: Option<HoldOut>,
-    /// ONNX file of the encoder with keypoints; by default the file that the room was encoded with
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["adapter", "fit"])]
-    model: Option<PathBuf>,
-    /// Folder of the images; by default that of the import. Rooms of `seese3 studio` are drawn again
-    #[arg(long, value_name = "DIR", conflicts_with_all = ["adapter", "fit"])]
-    images: Option<PathBuf>,
     /// Also locate the views by a peer: SIFT features, VLAD, triangulated points and PoseLib's
     /// absolute pose. PYTHON is an interpreter with numpy, opencv-python-headless and poselib
     #[arg(long, value_name = "PYTHON", conflicts_with_all = ["adapter", "fit"])]
@@ -84,7 +74,7 @@ pub struct Localization {
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
     seed: u64,
     #[command(flatten)]
-    runtime: RuntimeOptions,
+    views: KeypointViews,
     #[command(flatten)]
     json: JsonOutput,
 }
@@ -157,7 +147,7 @@ impl Localization {
         let features = features.context("the room's keypoints have no features")?;
 
         let (mapped, asked) = self.frames(&stored)?;
-        let encoded = self.encode(&stored, keypoints)?;
+        let encoded = self.views.encode(&stored, keypoints)?;
         let recording = TrialRecording {
             poses: stored.room.poses(),
             keypoints: &encoded.keypoints,
@@ -180,7 +170,7 @@ impl Localization {
 
         let progress = bar(asked.len() as u64, "localizing");
         let begun = Instant::now();
-        let found = self.runtime.pool()?.install(|| {
+        let found = self.views.runtime.pool()?.install(|| {
             let clock = || begun.elapsed().as_secs_f64();
             matched_localization::evaluate(recording, encoded.rows.view(), frames, &clock, &|| {
                 progress.inc(1)
@@ -193,41 +183,6 @@ impl Localization {
         self.write::<MatchedLocalization>(features, &found)
     }
 
-    /// Features and keypoints of all frames of the room, from its images.
-    fn encode(&self, stored: &StoredRoom, keypoints: &RoomKeypoints) -> anyhow::Result<Encoded> {
-        let source = &keypoints.source;
-        let model = keypoint_model(self.model.as_deref(), &source.model_file)?;
-        let models = [model.to_string_lossy().into_owned()];
-        let encoder = Encoder::of_keypoints(source, &models, &self.runtime.runtime())?;
-        let Some(encoder) = encoder else {
-            bail!(
-                "room '{}' was encoded by '{}', but {} is another model",
-                self.room,
-                source.feature.encoder,
-                model.display()
-            );
-        };
-
-        let size = encoder.render_size();
-        let images = RoomImages::of(&stored.room, self.images.as_deref(), size)?;
-        let progress = bar(stored.room.frame_count() as u64, "encoding");
-        let told = |done: usize| progress.set_position(done as u64);
-        let task = Task {
-            timeline: stored.room.timeline(),
-            image: &|row| images.image(row),
-            batch: BATCH,
-            on_bad: OnBadImage::Stop,
-            cancel: &Cancellation::default(),
-        };
-
-        let encoded = self
-            .runtime
-            .pool()?
-            .install(|| encode_room(&task, &encoder, None, &told))?;
-        progress.finish_and_clear();
-        Ok(encoded)
-    }
-
     /// The peer's answers to every N-th of the asked frames.
     fn ask(
         &self,
@@ -237,7 +192,7 @@ impl Localization {
         frames: MappedAndAsked<'_>,
     ) -> anyhow::Result<Vec<PeerAnswer>> {
         let height = (PEER_WIDTH as f64 * camera.height()).round() as usize;
-        let images = RoomImages::of(room, self.images.as_deref(), (PEER_WIDTH, height))?;
+        let images = RoomImages::of(room, self.views.images.as_deref(), (PEER_WIDTH, height))?;
         let queries: Vec<FrameId> = frames
             .asked
             .iter()

@@ -1,6 +1,7 @@
 //! `seese3 evaluate`: the paper's navigation table on a room's held-out pairs, and the errors of
 //! estimated trajectories.
 
+mod keypoint_views;
 mod localization;
 mod motion;
 mod odometry;

@@ -4,24 +4,27 @@
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use clap::Args;
 
 use seese3_core::splits::HoldOut;
 use seese3_core::training::RoomData;
+use seese3_lab::experiments::keypoint_odometry::{self, KeypointRecording};
 use seese3_lab::experiments::odometry::{
-    OdometryProtocol, RoomOdometry, evaluate, relocalisation, trackers,
+    OdometryProtocol, Relocalisation, RoomOdometry, evaluate, relocalisation, trackers,
 };
 use seese3_lab::report::{
     APE_FORMULA, coverage_table, odometry_json, odometry_table, other_rooms_text,
     relocalisation_text,
 };
+use seese3_robot::pose_filter::FilterParameters;
 use seese3_robot::tracking::{Replay, TrackerSettings};
 
 use super::super::named::one_of;
 use super::super::output::{JsonOutput, say, write_file};
 use super::super::progress::bar;
-use super::super::rooms::{data, load_rooms};
+use super::super::rooms::{data, load_rooms, room_names};
+use super::keypoint_views::KeypointViews;
 use super::say_leaks;
 use seese3_data::export::{kitti_trajectory, tum_trajectory};
 use seese3_store::Store;
@@ -34,9 +37,10 @@ pub struct Odometry {
     /// The rooms: names, or patterns with *
     #[arg(long = "room", required = true)]
     rooms: Vec<String>,
-    /// The adapter; it must be calibrated (`train --calibrate-on`), but in none of these rooms
+    /// The adapter; it must be calibrated (`train --calibrate-on`), but in none of these rooms. Without
+    /// one, matched keypoints alone track the camera, in rooms with keypoints
     #[arg(long)]
-    adapter: String,
+    adapter: Option<String>,
     /// Which frames are mapped and which are replayed
     #[arg(long, value_parser = one_of::<HoldOut>(), default_value = "blocks")]
     hold_out: HoldOut,
@@ -48,7 +52,7 @@ pub struct Odometry {
     no_fusion: bool,
     /// Fit an adapter to each room's mapped frames, initialized from --adapter, and correct the
     /// pose by its estimates
-    #[arg(long)]
+    #[arg(long, requires = "adapter")]
     fit: bool,
     /// Write each room's paths to this folder, as TUM and KITTI files: ROOM.truth, ROOM.fused and
     /// ROOM.odom
@@ -58,21 +62,25 @@ pub struct Odometry {
     #[arg(long)]
     each: bool,
     #[command(flatten)]
+    views: KeypointViews,
+    #[command(flatten)]
     json: JsonOutput,
 }
 
 impl Odometry {
-    #[expect(
-        clippy::too_many_lines,
-        reason = "one command, from its arguments to what it prints"
-    )]
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
-
         let store = Store::open(&self.store)?;
-        let stored = store.load_adapter(&self.adapter, None).await?;
+        match &self.adapter {
+            Some(adapter) => self.by_adapter(&store, adapter).await,
+            None => self.by_keypoints(&store).await,
+        }
+    }
+
+    async fn by_adapter(&self, store: &Store, adapter: &str) -> anyhow::Result<()> {
+        let stored = store.load_adapter(adapter, None).await?;
         let source = stored.adapter.source().name.clone();
-        let rooms = load_rooms(&store, &self.rooms, Some(&source)).await?;
+        let rooms = load_rooms(store, &self.rooms, Some(&source)).await?;
         say_leaks(&rooms, &stored.record);
 
         let adapter = stored.adapter;
@@ -85,11 +93,81 @@ impl Odometry {
             is_fitted: self.fit,
         };
         let trackers = trackers(&room_data, &adapter, &protocol)?;
+        let tracked = self.tracked(trackers.len(), |done| evaluate(&trackers, hold_out, done))?;
 
-        // Paths are written as each room completes; the first failure is reported at the end.
-        let progress = bar(trackers.len() as u64, "tracking");
+        // Relocalization needs at least two rooms to choose from.
+        let relocalised = (trackers.len() > 1)
+            .then(|| relocalisation(&trackers, hold_out))
+            .transpose()?;
+
+        let what = format!("adapter '{}' revision {}", stored.name, stored.revision);
+        let how = if self.no_fusion {
+            "dead reckoning"
+        } else if self.fit {
+            "fused with estimates of an adapter fitted to the mapped frames"
+        } else {
+            "fused with the most similar mapped frames"
+        };
+        self.report(&tracked, &what, how, relocalised.as_ref())
+    }
+
+    /// Tracks by matched keypoints alone.
+    async fn by_keypoints(&self, store: &Store) -> anyhow::Result<()> {
+        let mut rooms = Vec::new();
+        for name in room_names(store, &self.rooms).await? {
+            let stored = store.load_room(&name, None).await?;
+            let Some(keypoints) = &stored.keypoints else {
+                bail!(
+                    "room '{name}' has no keypoints: encode it with `seese3 encode --recipe xfeat-keypoints`, or \
+                     give --adapter"
+                );
+            };
+            let encoded = self.views.encode(&stored, keypoints)?;
+            rooms.push((stored.room.clone(), keypoints.map.camera, encoded));
+        }
+
+        let recordings: Vec<KeypointRecording<'_>> = rooms
+            .iter()
+            .map(|(room, camera, encoded)| KeypointRecording {
+                room,
+                features: encoded.rows.view(),
+                keypoints: &encoded.keypoints,
+                camera: *camera,
+            })
+            .collect();
+
+        let default = FilterParameters::default();
+        let parameters = FilterParameters {
+            keyframe_frames: self.keyframe_frames.unwrap_or(default.keyframe_frames),
+            fuse: !self.no_fusion,
+            ..default
+        };
+        let pool = self.views.runtime.pool()?;
+        let tracked = self.tracked(rooms.len(), |done| {
+            pool.install(|| {
+                keypoint_odometry::evaluate(&recordings, self.hold_out, parameters, done)
+            })
+        })?;
+        self.report(
+            &tracked,
+            "matched keypoints, no adapter",
+            "fused with located views",
+            None,
+        )
+    }
+
+    /// Evaluates with a progress bar. Paths are written as each room completes; the first failure
+    /// is reported at the end.
+    fn tracked(
+        &self,
+        count: usize,
+        evaluate: impl FnOnce(
+            &(dyn Fn(&RoomOdometry, &Replay) + Sync),
+        ) -> Result<Vec<RoomOdometry>, seese3_lab::experiments::Error>,
+    ) -> anyhow::Result<Vec<RoomOdometry>> {
+        let progress = bar(count as u64, "tracking");
         let unwritten: Mutex<Option<anyhow::Error>> = Mutex::new(None);
-        let tracked = evaluate(&trackers, hold_out, &|room, replay| {
+        let tracked = evaluate(&|room, replay| {
             if let Err(error) = self.write_paths(room, replay) {
                 let mut first = unwritten.lock().unwrap_or_else(PoisonError::into_inner);
                 first.get_or_insert(error);
@@ -98,58 +176,47 @@ impl Odometry {
         })?;
 
         progress.finish_and_clear();
-        if let Some(error) = unwritten
-            .into_inner()
-            .unwrap_or_else(PoisonError::into_inner)
-        {
-            return Err(error);
+        let unwritten = unwritten.into_inner();
+        match unwritten.unwrap_or_else(PoisonError::into_inner) {
+            Some(error) => Err(error),
+            None => Ok(tracked),
         }
+    }
 
-        // Relocalization needs at least two rooms to choose from.
-        let relocalised = (trackers.len() > 1)
-            .then(|| relocalisation(&trackers, hold_out))
-            .transpose()?;
-
+    fn report(
+        &self,
+        tracked: &[RoomOdometry],
+        what: &str,
+        how: &str,
+        relocalised: Option<&Relocalisation>,
+    ) -> anyhow::Result<()> {
         say(format_args!(
-            "{} {}, adapter '{}' revision {}, hold-out {}, {}",
-            trackers.len(),
-            if trackers.len() == 1 { "room" } else { "rooms" },
-            stored.name,
-            stored.revision,
-            hold_out.name(),
-            if self.no_fusion {
-                "dead reckoning"
-            } else if self.fit {
-                "fused with estimates of an adapter fitted to the mapped frames"
-            } else {
-                "fused with the most similar mapped frames"
-            },
+            "{} {}, {what}, hold-out {}, {how}",
+            tracked.len(),
+            if tracked.len() == 1 { "room" } else { "rooms" },
+            self.hold_out.name(),
         ));
 
-        let table = odometry_table(&tracked).to_string();
+        let table = odometry_table(tracked).to_string();
         let shown = if self.each || tracked.len() == 1 {
             table
         } else {
             only_mean(&table)
         };
         say(shown);
-        say(format_args!("\ncovariances:\n{}", coverage_table(&tracked)));
+        say(format_args!("\ncovariances:\n{}", coverage_table(tracked)));
 
-        if trackers.len() > 1 {
-            say(other_rooms_text(&tracked));
+        if tracked.len() > 1 {
+            say(other_rooms_text(tracked));
         }
-        if let Some(found) = &relocalised {
+        if let Some(found) = relocalised {
             say(relocalisation_text(found));
         }
 
         say(format_args!(
             "{APE_FORMULA}; root mean square without alignment"
         ));
-
-        self.json
-            .write(&odometry_json(&tracked, relocalised.as_ref()))?;
-
-        Ok(())
+        self.json.write(&odometry_json(tracked, relocalised))
     }
 
     /// The adapter's settings, overridden by the given options.

@@ -147,6 +147,7 @@ fn a_view_is_located_by_its_keypoints_without_an_adapter() {
     here.refuses(&broken, &["room 'damaged' cannot be served"]);
 
     tracks_without_an_adapter(&here, &to);
+    evaluates_odometry_without_an_adapter(&here);
 
     let strange = format!("localize {to} --room kitchen --camera mapping --image {other}");
     here.prints(
@@ -200,6 +201,28 @@ fn tracks_without_an_adapter(here: &Place, to: &str) {
     here.refuses(
         &format!("track {to} --room kitchen --feature exported/features_builtin.npy --count 2"),
         &["frame.view: must be an image"],
+    );
+}
+
+/// Oracle: the recorded poses. Views between the mapped frames are tracked nearer to them than the
+/// nearest frame is.
+fn evaluates_odometry_without_an_adapter(here: &Place) {
+    let ask = "evaluate odometry --store store --room kitchen --hold-out interleaved";
+    here.prints(
+        &format!("{ask} --json odometry.json"),
+        &["matched keypoints, no adapter"],
+    );
+    let found = here.json("odometry.json");
+    let error = |key: &str| number(&found["ape_m"][key]);
+    assert!(error("fused") < error("nearest_frame"), "{found}");
+    assert!(error("odom") < error("standing_still"), "{found}");
+    assert!(number(&found["coverage"]["95"]) > 0.5, "{found}");
+    assert_eq!(number(&found["tracking_wrong"]), 0.0);
+
+    here.succeeds("studio --rooms 1 --frames 20 --seed 3 --out plain --encode builtin");
+    here.refuses(
+        "evaluate odometry --store plain --room studio3-0000 --hold-out interleaved",
+        &["has no keypoints", "--adapter"],
     );
 }
 

@@ -210,7 +210,10 @@ pub fn evaluate(
 }
 
 /// The room of the mapped frames alone, as `seese3 encode` would map it.
-fn mapped_room(recording: TrialRecording<'_>, mapped: &[FrameId]) -> Result<KeypointRoom, Error> {
+pub(super) fn mapped_room(
+    recording: TrialRecording<'_>,
+    mapped: &[FrameId],
+) -> Result<KeypointRoom, Error> {
     let rows: Vec<usize> = mapped.iter().map(|frame| frame.row()).collect();
     let poses: Vec<Pose> = rows.iter().map(|&row| recording.poses[row]).collect();
     let keypoints: Vec<Keypoints> = rows
@@ -281,7 +284,7 @@ fn located(
 }
 
 /// Poses of the mapped frames with the most similar features.
-struct Baselines<'a> {
+pub(super) struct Baselines<'a> {
     /// `world_from_camera` of the mapped frames.
     poses: Vec<Pose>,
     /// Features of all frames, scaled to unit length.
@@ -290,7 +293,11 @@ struct Baselines<'a> {
 }
 
 impl<'a> Baselines<'a> {
-    fn new(poses: &[Pose], features: ArrayView2<'_, f32>, mapped: &'a [FrameId]) -> Self {
+    pub(super) fn new(
+        poses: &[Pose],
+        features: ArrayView2<'_, f32>,
+        mapped: &'a [FrameId],
+    ) -> Self {
         let mut features = features.to_owned();
         for mut row in features.rows_mut() {
             let length = row.dot(&row).sqrt().max(1e-12);
@@ -306,7 +313,7 @@ impl<'a> Baselines<'a> {
 
     /// The pose of the most similar mapped frame, and the mean of the three most similar ones,
     /// weighted by the inverse fourth power of the distance between unit features.
-    fn poses_of(&self, row: usize) -> (Pose, Pose) {
+    pub(super) fn poses_of(&self, row: usize) -> (Pose, Pose) {
         let view = self.features.row(row);
         let mut similar: Vec<(f64, &Pose)> = self
             .mapped

@@ -20,6 +20,7 @@ pub mod adapter_sweep;
 pub mod cross_room;
 pub mod folds;
 pub mod formulations;
+pub mod keypoint_odometry;
 pub mod layers;
 pub mod localization;
 pub mod matched_localization;

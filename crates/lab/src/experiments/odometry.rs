@@ -29,9 +29,9 @@ use super::{Error, Within, check_hold_out};
 use crate::json;
 
 /// Frame period of replays that contain frames of another room, nanoseconds: 30 Hz.
-const PERIOD_NS: i64 = 33_333_333;
+pub(super) const PERIOD_NS: i64 = 33_333_333;
 /// Maximum number of frames of each other room replayed through a room's tracker.
-const OTHER_ROOM_FRAMES: usize = 60;
+pub(super) const OTHER_ROOM_FRAMES: usize = 60;
 /// Stride of the tracked frames that are relocalized in all rooms.
 const RELOCALISED_STEP: usize = 5;
 
@@ -310,9 +310,18 @@ pub fn evaluate(
     done: &(dyn Fn(&RoomOdometry, &Replay) + Sync),
 ) -> Result<Vec<RoomOdometry>, Error> {
     let one = |room: &TrackedRoom<'_>| {
-        let own = own_replay(room, hold_out, InitialPose::Given);
-        let found = room_odometry(room, rooms, hold_out, &own)?;
-        done(&found, &own);
+        let given = own_replay(room, hold_out, InitialPose::Given);
+        let replays = RoomReplays {
+            room: &room.room,
+            hold_out,
+            given: &given,
+            unknown: &own_replay(room, hold_out, InitialPose::Unknown),
+            other_rooms: [None, Some(hold_out)].map(|own| lost_frames(room, rooms, own)),
+            nearest: &|frame| *room.most_alike(room.features.row(frame.row())),
+        };
+
+        let found = room_odometry(&replays)?;
+        done(&found, &given);
         Ok(found)
     };
 
@@ -397,14 +406,31 @@ impl Relocalisation {
     }
 }
 
-fn room_odometry(
-    room: &TrackedRoom<'_>,
-    all: &[TrackedRoom<'_>],
-    hold_out: HoldOut,
-    own: &Replay,
-) -> Result<RoomOdometry, Error> {
-    let frame_count = room.room.frame_count();
-    let what = || format!("room '{}'", room.room.id());
+/// The replays of a room's tracked frames.
+pub(super) struct RoomReplays<'a> {
+    pub room: &'a Room,
+    pub hold_out: HoldOut,
+    /// With the true initial pose.
+    pub given: &'a Replay,
+    /// Without an initial pose.
+    pub unknown: &'a Replay,
+    /// LOST counts for frames of other rooms, see [`RoomOdometry::other_rooms`].
+    pub other_rooms: [LostFrames; 2],
+    /// The pose of the mapped frame most similar to a frame.
+    pub nearest: &'a dyn Fn(FrameId) -> Pose,
+}
+
+pub(super) fn room_odometry(replays: &RoomReplays<'_>) -> Result<RoomOdometry, Error> {
+    let RoomReplays {
+        room,
+        hold_out,
+        given: own,
+        unknown,
+        other_rooms,
+        nearest,
+    } = *replays;
+    let frame_count = room.frame_count();
+    let what = || format!("room '{}'", room.id());
 
     let odom = path_errors(&own.odom_path(), &own.truth).within(what)?;
     let fused_path = own.map_path();
@@ -418,18 +444,15 @@ fn room_odometry(
         fused: fused[place],
     };
 
-    let unknown = own_replay(room, hold_out, InitialPose::Unknown);
-    let tracked = hold_out.tracked(room.room.timeline());
+    let tracked = hold_out.tracked(room.timeline());
     let has_mapped_neighbours =
         |row: usize| hold_out.has_mapped_neighbours(tracked[row], frame_count);
 
     Ok(RoomOdometry {
-        room: room.room.id().to_string(),
-        scores: TrackingScores::of(own, |row| {
-            *room.most_alike(room.features.row(tracked[row].row()))
-        }),
-        format: room.room.provenance().format.clone(),
-        mapped_frames: hold_out.mapped(room.room.timeline()).len(),
+        room: room.id().to_string(),
+        scores: TrackingScores::of(own, |row| nearest(tracked[row])),
+        format: room.provenance().format.clone(),
+        mapped_frames: hold_out.mapped(room.timeline()).len(),
         tracked_frames: own.updates.len(),
         paths: PathErrors {
             ape_m: both(0),
@@ -446,7 +469,7 @@ fn room_odometry(
             lost: unknown.share(Status::Lost),
             frames_to_relocalise: unknown.frames_to_relocalise(),
         },
-        other_rooms: [None, Some(hold_out)].map(|own| lost_frames(room, all, own)),
+        other_rooms,
     })
 }
 

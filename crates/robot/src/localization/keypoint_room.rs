@@ -156,6 +156,19 @@ impl KeypointRoom {
         self.locate_among(view, Candidates::Near(predicted))
     }
 
+    /// The pose of a view: near a predicted pose if there is one and it succeeds, else anywhere.
+    ///
+    /// # Errors
+    /// As [`KeypointRoom::locate`].
+    pub fn locate_from(
+        &self,
+        view: ViewKeypoints<'_>,
+        predicted: Option<&Pose>,
+    ) -> Result<LocatedView, NotLocated> {
+        let near = predicted.and_then(|predicted| self.locate_near(view, predicted).ok());
+        near.map_or_else(|| self.locate(view), Ok)
+    }
+
     /// The focal length that fits a view's matches best, image widths, and the number of keypoints
     /// that agree with it; `None` if they are too few.
     pub(super) fn fitted_focal(&self, view: ViewKeypoints<'_>) -> Option<(f64, usize)> {

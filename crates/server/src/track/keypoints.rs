@@ -74,17 +74,6 @@ impl StreamRooms<'_> {
             is_matched.then_some((place, keypoints.room.as_ref()))
         })
     }
-
-    /// Locates a view in a room: near the predicted pose, else anywhere.
-    fn located(
-        &self,
-        room: &KeypointRoom,
-        view: ViewKeypoints<'_>,
-    ) -> Result<LocatedView, NotLocated> {
-        let near = self.predicted.filter(|_| self.room.is_some());
-        let near = near.and_then(|predicted| room.locate_near(view, &predicted).ok());
-        near.map_or_else(|| room.locate(view), Ok)
-    }
 }
 
 impl StreamCamera {
@@ -149,7 +138,8 @@ impl StreamCamera {
                 keypoints: &image.keypoints,
                 camera: &camera,
             };
-            match rooms.located(room, view) {
+            let predicted = rooms.predicted.as_ref().filter(|_| rooms.room.is_some());
+            match room.locate_from(view, predicted) {
                 Ok(found) => {
                     let most = best.as_ref().map_or(0, |(_, best)| best.inliers);
                     if found.inliers > most {
