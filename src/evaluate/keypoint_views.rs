@@ -21,8 +21,9 @@ pub struct KeypointViews {
     /// ONNX file of the encoder with keypoints; by default the file that the room was encoded with
     #[arg(long, value_name = "FILE", conflicts_with = "adapter")]
     pub model: Option<PathBuf>,
-    /// Folder of the images; by default that of the import. Rooms of `seese3 studio` are drawn again
-    #[arg(long, value_name = "DIR", conflicts_with = "adapter")]
+    /// Folder of the images; by default that of the import. Without an adapter, rooms of `seese3 studio`
+    /// are drawn again
+    #[arg(long, value_name = "DIR")]
     pub images: Option<PathBuf>,
     #[command(flatten)]
     pub runtime: RuntimeOptions,
@@ -38,19 +39,7 @@ impl KeypointViews {
         stored: &StoredRoom,
         keypoints: &RoomKeypoints,
     ) -> anyhow::Result<Encoded> {
-        let source = &keypoints.source;
-        let model = keypoint_model(self.model.as_deref(), &source.model_file)?;
-        let models = [model.to_string_lossy().into_owned()];
-        let encoder = Encoder::of_keypoints(source, &models, &self.runtime.runtime())?;
-        let Some(encoder) = encoder else {
-            bail!(
-                "room '{}' was encoded by '{}', but {} is another model",
-                stored.room.id(),
-                source.feature.encoder,
-                model.display()
-            );
-        };
-
+        let encoder = self.encoder(stored, keypoints)?;
         let size = encoder.render_size();
         let images = RoomImages::of(&stored.room, self.images.as_deref(), size)?;
         let progress = bar(stored.room.frame_count() as u64, "encoding");
@@ -69,5 +58,58 @@ impl KeypointViews {
             .install(|| encode_room(&task, &encoder, None, &told))?;
         progress.finish_and_clear();
         Ok(encoded)
+    }
+
+    /// The keypoints of a room, and those of all its frames with their features.
+    ///
+    /// # Errors
+    /// As [`KeypointViews::encode`], or if the room has no keypoints.
+    pub fn encode_matchable<'a>(
+        &self,
+        stored: &'a StoredRoom,
+    ) -> anyhow::Result<(&'a RoomKeypoints, Encoded)> {
+        let Some(keypoints) = &stored.keypoints else {
+            bail!(
+                "room '{}' has no keypoints: encode it with `seese3 encode --recipe xfeat-keypoints`, or give \
+                 --adapter",
+                stored.room.id()
+            );
+        };
+        Ok((keypoints, self.encode(stored, keypoints)?))
+    }
+
+    /// The encoder of a room's keypoints.
+    ///
+    /// # Errors
+    /// A description if the model is not that of the room.
+    pub fn encoder(
+        &self,
+        stored: &StoredRoom,
+        keypoints: &RoomKeypoints,
+    ) -> anyhow::Result<Encoder> {
+        let source = &keypoints.source;
+        let model = keypoint_model(self.model.as_deref(), &source.model_file)?;
+        let models = [model.to_string_lossy().into_owned()];
+        let encoder = Encoder::of_keypoints(source, &models, &self.runtime.runtime())?;
+        let Some(encoder) = encoder else {
+            bail!(
+                "room '{}' was encoded by '{}', but {} is another model",
+                stored.room.id(),
+                source.feature.encoder,
+                model.display()
+            );
+        };
+        Ok(encoder)
+    }
+
+    /// Refuses --images for a command that reads none.
+    ///
+    /// # Errors
+    /// A description if --images is given.
+    pub fn refuse_images(&self) -> anyhow::Result<()> {
+        if self.images.is_some() {
+            bail!("--images is for matched keypoints: leave out --adapter and --fit, or --images");
+        }
+        Ok(())
     }
 }

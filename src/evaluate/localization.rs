@@ -90,6 +90,7 @@ impl Localization {
             return self.evaluate_matched(&store).await;
         }
 
+        self.views.refuse_images()?;
         let stored_adapter = match &self.adapter {
             Some(name) => Some(store.load_adapter(name, None).await?),
             None => None,

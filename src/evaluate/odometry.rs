@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-use anyhow::{Context, bail};
+use anyhow::Context;
 use clap::Args;
 
 use seese3_core::splits::HoldOut;
@@ -72,7 +72,10 @@ impl Odometry {
         self.json.begin()?;
         let store = Store::open(&self.store)?;
         match &self.adapter {
-            Some(adapter) => self.by_adapter(&store, adapter).await,
+            Some(adapter) => {
+                self.views.refuse_images()?;
+                self.by_adapter(&store, adapter).await
+            }
             None => self.by_keypoints(&store).await,
         }
     }
@@ -116,13 +119,7 @@ impl Odometry {
         let mut rooms = Vec::new();
         for name in room_names(store, &self.rooms).await? {
             let stored = store.load_room(&name, None).await?;
-            let Some(keypoints) = &stored.keypoints else {
-                bail!(
-                    "room '{name}' has no keypoints: encode it with `seese3 encode --recipe xfeat-keypoints`, or \
-                     give --adapter"
-                );
-            };
-            let encoded = self.views.encode(&stored, keypoints)?;
+            let (keypoints, encoded) = self.views.encode_matchable(&stored)?;
             rooms.push((stored.room.clone(), keypoints.map.camera, encoded));
         }
 

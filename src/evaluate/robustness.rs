@@ -1,18 +1,19 @@
 //! `seese3 evaluate robustness`: tracks rooms with disturbed images.
 
-use std::path::{Path, PathBuf};
-
 use anyhow::{Context, bail};
 use clap::Args;
-use ndarray::Array2;
 use rayon::prelude::*;
 
 use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
-use seese3_core::room::FrameId;
+use seese3_core::keypoints::Keypoints;
+use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::HoldOut;
 use seese3_core::training::RoomData;
-use seese3_lab::experiments::odometry::{OdometryProtocol, TrackedRoom, trackers};
+use seese3_lab::experiments::keypoint_odometry::{
+    DisturbedKeypoints, DisturbedRoom, KeypointRecording,
+};
+use seese3_lab::experiments::odometry::{OdometryProtocol, trackers};
 use seese3_lab::experiments::robustness::{
     Disturbance, DisturbedTracking, DisturbedViews, changed_images, evaluate,
 };
@@ -20,13 +21,14 @@ use seese3_lab::report::{robustness_json, robustness_table};
 use seese3_robot::tracking::TrackerSettings;
 
 use super::super::encode::images_root;
-use super::super::encoder::RuntimeOptions;
 use super::super::named::one_of;
 use super::super::output::{JsonOutput, say};
 use super::super::progress::bar;
-use super::super::rooms::{data, load_rooms};
+use super::super::rooms::{data, load_rooms, room_names};
+use super::keypoint_views::KeypointViews;
+use super::room_images::RoomImages;
 use super::say_leaks;
-use seese3_encoder::{Encoder, read_image};
+use seese3_encoder::{EncodedFrame, Encoder};
 use seese3_store::Store;
 
 #[derive(Debug, Args)]
@@ -37,15 +39,13 @@ pub struct Robustness {
     /// The rooms, imported with images: names, or patterns with *
     #[arg(long = "room", required = true)]
     rooms: Vec<String>,
-    /// The adapter; it must be calibrated (`train --calibrate-on`), but in none of these rooms
-    #[arg(long)]
-    adapter: String,
+    /// The adapter; it must be calibrated (`train --calibrate-on`), but in none of these rooms. Without
+    /// one, matched keypoints alone track the camera, in rooms with keypoints
+    #[arg(long, requires = "encoder")]
+    adapter: Option<String>,
     /// The encoder that the adapter was trained on: an ONNX file, `pixels` or `builtin`
-    #[arg(long)]
-    encoder: String,
-    /// Folder of the images; the original folder of the room if omitted
-    #[arg(long)]
-    images: Option<PathBuf>,
+    #[arg(long, requires = "adapter")]
+    encoder: Option<String>,
     /// Which frames are mapped and which are replayed
     #[arg(long, value_parser = one_of::<HoldOut>(), default_value = "interleaved")]
     hold_out: HoldOut,
@@ -53,7 +53,7 @@ pub struct Robustness {
     #[arg(long = "only", value_name = "TEXT")]
     only: Vec<String>,
     #[command(flatten)]
-    runtime: RuntimeOptions,
+    views: KeypointViews,
     #[command(flatten)]
     json: JsonOutput,
 }
@@ -64,14 +64,20 @@ const BATCH: usize = 16;
 impl Robustness {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
-
         let store = Store::open(&self.store)?;
-        let stored = store.load_adapter(&self.adapter, None).await?;
+        match (&self.adapter, &self.encoder) {
+            (Some(adapter), Some(encoder)) => self.by_adapter(&store, adapter, encoder).await,
+            _ => self.by_keypoints(&store).await,
+        }
+    }
+
+    async fn by_adapter(&self, store: &Store, adapter: &str, encoder: &str) -> anyhow::Result<()> {
+        let stored = store.load_adapter(adapter, None).await?;
         let source = stored.adapter.source().clone();
-        let rooms = load_rooms(&store, &self.rooms, Some(&source.name)).await?;
+        let rooms = load_rooms(store, &self.rooms, Some(&source.name)).await?;
         say_leaks(&rooms, &stored.record);
 
-        let encoder = self.encoder_of(&source)?;
+        let encoder = self.encoder_of(&source, encoder, adapter)?;
         let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
         let protocol = OdometryProtocol {
             hold_out: self.hold_out,
@@ -83,45 +89,117 @@ impl Robustness {
         let disturbances = self.disturbances()?;
         let steps = trackers.len() * disturbances.len();
         let progress = bar(steps as u64, "disturbing");
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(self.runtime.threads())
-            .build()?;
+        let pool = self.views.runtime.pool()?;
 
         let mut found: Vec<DisturbedTracking> = Vec::with_capacity(steps);
-        for room in &trackers {
-            let root = images_root(room.room(), self.images.as_deref())?;
+        for tracker in &trackers {
+            let room = tracker.room();
+            let images = RoomImages::Folder {
+                root: images_root(room, self.views.images.as_deref())?,
+                images: room.images(),
+            };
+            let tracked = self.hold_out.tracked(room.timeline());
+            let rows: Vec<usize> = tracked.iter().map(|frame| frame.row()).collect();
+            let features = tracker.features().select(ndarray::Axis(0), &rows);
             for &disturbance in &disturbances {
                 let camera = DisturbedCamera {
                     encoder: &encoder,
-                    root: &root,
+                    images: &images,
                     disturbance,
                 };
-                let one = pool.install(|| camera.track(room, self.hold_out));
-                found.push(one.with_context(|| {
-                    format!(
-                        "room '{}', disturbance {}",
-                        room.room().id(),
-                        disturbance.name()
-                    )
-                })?);
+                let mut features = features.clone();
+                let mut is_blank = vec![false; rows.len()];
+                let one = pool.install(|| {
+                    camera.each_changed(room, self.hold_out, |row, frame, blank| {
+                        let feature = ndarray::Array1::from(frame.feature);
+                        features.row_mut(row).assign(&feature);
+                        is_blank[row] = blank;
+                    })?;
+                    let views = DisturbedViews {
+                        features: features.view(),
+                        is_blank: &is_blank,
+                    };
+                    Ok(evaluate(tracker, self.hold_out, disturbance, views)?)
+                });
+                found.push(named(one, room, disturbance)?);
                 progress.inc(1);
             }
         }
         progress.finish_and_clear();
 
+        let what = format!("adapter '{}' revision {}", stored.name, stored.revision);
+        self.report(&found, trackers.len(), &what, Some(&stored.name))
+    }
+
+    /// Tracks by matched keypoints alone.
+    async fn by_keypoints(&self, store: &Store) -> anyhow::Result<()> {
+        let disturbances = self.disturbances()?;
+        let names = room_names(store, &self.rooms).await?;
+        let pool = self.views.runtime.pool()?;
+
+        let mut found: Vec<DisturbedTracking> = Vec::new();
+        for name in &names {
+            let stored = store.load_room(name, None).await?;
+            let (keypoints, encoded) = self.views.encode_matchable(&stored)?;
+            let encoder = self.views.encoder(&stored, keypoints)?;
+            let room = &stored.room;
+            let size = encoder.render_size();
+            let images = RoomImages::of(room, self.views.images.as_deref(), size)?;
+
+            let recording = KeypointRecording {
+                room,
+                features: encoded.rows.view(),
+                keypoints: &encoded.keypoints,
+                camera: keypoints.map.camera,
+            };
+            let mapped = pool.install(|| DisturbedRoom::new(&recording, self.hold_out))?;
+            let tracked = self.hold_out.tracked(room.timeline());
+            let rows: Vec<usize> = tracked.iter().map(|frame| frame.row()).collect();
+            let progress = bar(disturbances.len() as u64, "disturbing");
+            for &disturbance in &disturbances {
+                let camera = DisturbedCamera {
+                    encoder: &encoder,
+                    images: &images,
+                    disturbance,
+                };
+                let mut features = encoded.rows.select(ndarray::Axis(0), &rows);
+                let of_row = |&row: &usize| encoded.keypoints[row].clone();
+                let mut keypoints: Vec<Keypoints> = rows.iter().map(of_row).collect();
+                let one = pool.install(|| {
+                    camera.each_changed(room, self.hold_out, |row, frame, blank| {
+                        let feature = ndarray::Array1::from(frame.feature);
+                        features.row_mut(row).assign(&feature);
+                        let detected = frame.keypoints.filter(|_| !blank);
+                        keypoints[row] = detected.unwrap_or_default();
+                    })?;
+                    let views = DisturbedKeypoints {
+                        features: features.view(),
+                        keypoints: &keypoints,
+                    };
+                    Ok(mapped.track(disturbance, views))
+                });
+                found.push(named(one, room, disturbance)?);
+                progress.inc(1);
+            }
+            progress.finish_and_clear();
+        }
+        self.report(&found, names.len(), "matched keypoints, no adapter", None)
+    }
+
+    fn report(
+        &self,
+        found: &[DisturbedTracking],
+        rooms: usize,
+        what: &str,
+        adapter: Option<&str>,
+    ) -> anyhow::Result<()> {
         say(format_args!(
-            "{} rooms, adapter '{}' revision {}, hold-out {}; blank and frozen cameras are scored only while blank or frozen",
-            trackers.len(),
-            stored.name,
-            stored.revision,
+            "{rooms} rooms, {what}, hold-out {}; blank and frozen cameras are scored only while blank or frozen",
             self.hold_out.name(),
         ));
-        say(robustness_table(&found));
-
+        say(robustness_table(found));
         self.json
-            .write(&robustness_json(&found, &stored.name, self.hold_out))?;
-
-        Ok(())
+            .write(&robustness_json(found, adapter, self.hold_out))
     }
 
     /// The disturbances selected by `--only`.
@@ -145,15 +223,18 @@ impl Robustness {
         Ok(asked)
     }
 
-    fn encoder_of(&self, source: &FeatureSource) -> anyhow::Result<Encoder> {
-        let models = [self.encoder.clone()];
-        let encoder = Encoder::of_source(source, &models, &self.runtime.runtime())?;
+    fn encoder_of(
+        &self,
+        source: &FeatureSource,
+        model: &str,
+        adapter: &str,
+    ) -> anyhow::Result<Encoder> {
+        let models = [model.to_owned()];
+        let encoder = Encoder::of_source(source, &models, &self.views.runtime.runtime())?;
         let Some(encoder) = encoder else {
             bail!(
-                "adapter '{}' was trained on features of encoder '{}', but {} is another encoder",
-                self.adapter,
+                "adapter '{adapter}' was trained on features of encoder '{}', but {model} is another encoder",
                 source.encoder,
-                self.encoder
             );
         };
 
@@ -167,56 +248,51 @@ impl Robustness {
     }
 }
 
+/// Names the room and the disturbance of an error.
+fn named(
+    found: anyhow::Result<DisturbedTracking>,
+    room: &Room,
+    disturbance: Disturbance,
+) -> anyhow::Result<DisturbedTracking> {
+    found.with_context(|| format!("room '{}', disturbance {}", room.id(), disturbance.name()))
+}
+
 /// A camera with disturbed images.
 struct DisturbedCamera<'a> {
     encoder: &'a Encoder,
-    root: &'a Path,
+    images: &'a RoomImages<'a>,
     disturbance: Disturbance,
 }
 
 impl DisturbedCamera<'_> {
-    fn track(
+    /// Encodes the images that the disturbance changes. `take` gets the row of a frame among the tracked
+    /// ones, its encoding, and whether the image is blank.
+    fn each_changed(
         &self,
-        room: &TrackedRoom<'_>,
+        room: &Room,
         hold_out: HoldOut,
-    ) -> anyhow::Result<DisturbedTracking> {
-        let tracked = hold_out.tracked(room.room().timeline());
-        let rows: Vec<usize> = tracked.iter().map(|frame| frame.row()).collect();
-        let mut features = room.features().select(ndarray::Axis(0), &rows);
-        let mut is_blank = vec![false; rows.len()];
-
+        mut take: impl FnMut(usize, EncodedFrame, bool),
+    ) -> anyhow::Result<()> {
+        let tracked = hold_out.tracked(room.timeline());
         let changed = changed_images(room, hold_out, self.disturbance);
         for batch in changed.chunks(BATCH) {
             let images: Vec<(RgbImage, bool)> = batch
                 .par_iter()
-                .map(|&(row, number)| self.image(room, tracked[row], number))
+                .map(|&(row, number)| self.image(tracked[row], number))
                 .collect::<anyhow::Result<_>>()?;
             let clips: Vec<Vec<&RgbImage>> = images.iter().map(|(image, _)| vec![image]).collect();
-            let encoded: Array2<f32> = self.encoder.encode(&clips)?;
+            let encoded = self.encoder.encode_frames(&clips)?;
 
-            for ((&(row, _), encoded), (_, blank)) in
-                batch.iter().zip(encoded.outer_iter()).zip(&images)
-            {
-                features.row_mut(row).assign(&encoded);
-                is_blank[row] = *blank;
+            for ((&(row, _), encoded), (_, blank)) in batch.iter().zip(encoded).zip(&images) {
+                take(row, encoded, *blank);
             }
         }
-
-        let views = DisturbedViews {
-            features: features.view(),
-            is_blank: &is_blank,
-        };
-        Ok(evaluate(room, hold_out, self.disturbance, views)?)
+        Ok(())
     }
 
     /// A frame's disturbed image, prepared for the encoder, and whether it is blank.
-    fn image(
-        &self,
-        room: &TrackedRoom<'_>,
-        frame: FrameId,
-        number: usize,
-    ) -> anyhow::Result<(RgbImage, bool)> {
-        let image = read_image(self.root, &room.room().images()[frame.row()])?;
+    fn image(&self, frame: FrameId, number: usize) -> anyhow::Result<(RgbImage, bool)> {
+        let image = self.images.image(frame.row())?;
         let disturbed = self.disturbance.disturbed(&image, number);
         let is_blank = disturbed.is_blank();
 

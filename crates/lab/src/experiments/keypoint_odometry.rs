@@ -1,7 +1,8 @@
 //! Evaluates the filter of located views on held-out frames: no adapter, keypoints alone.
 //!
 //! Every room is mapped and tracked under one hold-out, as in [`super::odometry`]. Its frames are
-//! located near the last pose while TRACKING, as the service does it.
+//! located near the last pose while TRACKING, as the service does it. A [`DisturbedRoom`] is tracked by
+//! a camera with disturbed images.
 
 use ndarray::ArrayView2;
 use rayon::prelude::*;
@@ -11,7 +12,7 @@ use seese3_core::keypoints::Keypoints;
 use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::HoldOut;
 use seese3_core::trajectory::Trajectory;
-use seese3_robot::localization::KeypointRoom;
+use seese3_robot::localization::{FocalSearch, KeypointRoom, LocatedView, NotLocated};
 use seese3_robot::matched_views::{TrialRecording, ViewKeypoints};
 use seese3_robot::pose_filter::{FilterParameters, FilterRoom, PoseFilter, ViewObservation};
 use seese3_robot::tracking::{
@@ -22,6 +23,7 @@ use super::matched_localization::{Baselines, mapped_room};
 use super::odometry::{
     LostFrames, OTHER_ROOM_FRAMES, PERIOD_NS, RoomOdometry, RoomReplays, room_odometry,
 };
+use super::robustness::{Disturbance, DisturbedTracking, PlannedFrame, plan, scored};
 use super::{Error, Within, check_hold_out};
 
 /// A recording with the keypoints of all its frames.
@@ -160,10 +162,30 @@ impl<'a> TrackedRoom<'a> {
         period_ns: i64,
         initial: InitialPose,
     ) -> Replay {
-        let first = frames.first().filter(|_| initial == InitialPose::Given);
-        let first = first.map(|(recording, frame)| {
-            PoseWithCovariance::known(recording.room.poses()[frame.row()], 1e-3, 1e-3)
+        let mut sequence: u64 = 0;
+        let mut before: Option<FrameId> = None;
+        let played = frames.iter().map(|(recording, frame)| {
+            // Rows left out leave gaps in the numbers; there is none between recordings.
+            let step = before.filter(|before| before.0 < frame.0);
+            sequence += step.map_or(1, |before| u64::from(frame.0 - before.0));
+            before = Some(*frame);
+            PlayedView {
+                time_ns: sequence as i64 * period_ns,
+                sequence,
+                keypoints: &recording.keypoints[frame.row()],
+                camera: Some(recording.camera),
+                // Frames of a recording differ from each other.
+                fingerprint: sequence,
+                truth: recording.room.poses()[frame.row()],
+            }
         });
+        self.play(&played.collect::<Vec<_>>(), initial)
+    }
+
+    /// Replays views through the filter.
+    fn play(&self, views: &[PlayedView<'_>], initial: InitialPose) -> Replay {
+        let first = views.first().filter(|_| initial == InitialPose::Given);
+        let first = first.map(|view| PoseWithCovariance::known(view.truth, 1e-3, 1e-3));
         let mut state = self.filter.start(first.as_ref());
         let mut replay = Replay {
             truth: Trajectory::default(),
@@ -172,17 +194,25 @@ impl<'a> TrackedRoom<'a> {
             beginnings: vec![0],
         };
 
-        let mut sequence: u64 = 0;
-        let mut before: Option<FrameId> = None;
         let mut predicted: Option<Pose> = None;
-        for (recording, frame) in frames {
-            // Rows left out leave gaps in the numbers; there is none between recordings.
-            let step = before.filter(|before| before.0 < frame.0);
-            sequence += step.map_or(1, |before| u64::from(frame.0 - before.0));
-            before = Some(*frame);
-
-            let observation =
-                self.observation(recording, *frame, sequence, period_ns, predicted.as_ref());
+        let mut search = FocalSearch::default();
+        for view in views {
+            let camera = view.camera.or_else(|| {
+                let height = self.recording.camera.height();
+                search.camera(view.keypoints, height, std::iter::once(&self.map))
+            });
+            let located = camera.map(|camera| {
+                let matched = ViewKeypoints {
+                    keypoints: view.keypoints,
+                    camera: &camera,
+                };
+                let located = self.map.locate_from(matched, predicted.as_ref());
+                match view.camera {
+                    Some(_) => located,
+                    None => located.map(|located| search.with_focal_of(&camera, located)),
+                }
+            });
+            let observation = self.observation(view, located);
             let Ok(update) = self.filter.observe(&mut state, &observation) else {
                 continue;
             };
@@ -192,8 +222,8 @@ impl<'a> TrackedRoom<'a> {
             predicted = tracked.map(|tracked| tracked.pose);
 
             replay.truth.times_ns.push(observation.time_ns);
-            replay.truth.poses.push(recording.room.poses()[frame.row()]);
-            replay.sequences.push(sequence);
+            replay.truth.poses.push(view.truth);
+            replay.sequences.push(view.sequence);
             replay.updates.push(update);
         }
         replay
@@ -201,26 +231,19 @@ impl<'a> TrackedRoom<'a> {
 
     fn observation(
         &self,
-        recording: &KeypointRecording<'_>,
-        frame: FrameId,
-        sequence: u64,
-        period_ns: i64,
-        predicted: Option<&Pose>,
+        view: &PlayedView<'_>,
+        located: Option<Result<LocatedView, NotLocated>>,
     ) -> ViewObservation {
-        let keypoints = &recording.keypoints[frame.row()];
-        let view = ViewKeypoints {
-            keypoints,
-            camera: &recording.camera,
-        };
-        let located = self.map.locate_from(view, predicted);
         let (novelty, unlocated) = match &located {
-            Ok(found) => (found.novelty, String::new()),
-            Err(why) => (why.novelty().unwrap_or(f64::INFINITY), why.to_string()),
+            Some(Ok(found)) => (found.novelty, String::new()),
+            Some(Err(why)) => (why.novelty().unwrap_or(f64::INFINITY), why.to_string()),
+            None => (f64::INFINITY, "the camera is unknown".to_owned()),
         };
+        let located = located.and_then(Result::ok);
         ViewObservation {
-            time_ns: sequence as i64 * period_ns,
-            sequence,
-            matched: located.ok().map(|found| MatchedPose {
+            time_ns: view.time_ns,
+            sequence: view.sequence,
+            matched: located.map(|found| MatchedPose {
                 room: 0,
                 pose: found.pose,
                 novelty: found.novelty,
@@ -228,8 +251,78 @@ impl<'a> TrackedRoom<'a> {
             }),
             novelty,
             unlocated,
-            // Frames of a recording differ from each other.
-            fingerprint: (!keypoints.is_empty()).then_some(sequence),
+            fingerprint: (!view.keypoints.is_empty()).then_some(view.fingerprint),
         }
+    }
+}
+
+/// A view of a stream.
+struct PlayedView<'a> {
+    time_ns: i64,
+    sequence: u64,
+    keypoints: &'a Keypoints,
+    /// `None` if the service has to estimate it.
+    camera: Option<CameraIntrinsics>,
+    /// Equal for identical images.
+    fingerprint: u64,
+    /// `world_from_camera`.
+    truth: Pose,
+}
+
+/// Views of a disturbed camera, one per tracked frame of a room.
+#[derive(Debug, Clone, Copy)]
+pub struct DisturbedKeypoints<'a> {
+    /// Features, shape (tracked frames, d), for the nearest frame.
+    pub features: ArrayView2<'a, f32>,
+    /// Keypoints; none for a blank image.
+    pub keypoints: &'a [Keypoints],
+}
+
+/// A room with its mapped part, to be tracked by a disturbed camera.
+pub struct DisturbedRoom<'a>(TrackedRoom<'a>, HoldOut);
+
+impl<'a> DisturbedRoom<'a> {
+    /// Maps a part of a recording.
+    ///
+    /// # Errors
+    /// As [`evaluate`].
+    pub fn new(recording: &KeypointRecording<'a>, hold_out: HoldOut) -> Result<Self, Error> {
+        let parameters = FilterParameters::default();
+        Ok(Self(
+            TrackedRoom::new(recording, hold_out, parameters)?,
+            hold_out,
+        ))
+    }
+
+    /// Tracks the disturbed streams. The camera is that of the map, stated, except for a narrower
+    /// field of view: then it is unknown, and estimated from the first views.
+    pub fn track(
+        &self,
+        disturbance: Disturbance,
+        views: DisturbedKeypoints<'_>,
+    ) -> DisturbedTracking {
+        let Self(tracked, hold_out) = self;
+        let room = tracked.recording.room;
+        let is_known = !matches!(disturbance, Disturbance::FieldOfView { .. });
+        let played = |frame: &PlannedFrame| PlayedView {
+            time_ns: frame.time_ns,
+            sequence: frame.sequence,
+            keypoints: &views.keypoints[frame.view],
+            camera: is_known.then_some(tracked.recording.camera),
+            fingerprint: frame.view as u64,
+            truth: frame.truth,
+        };
+
+        let streams = plan(room, *hold_out, disturbance).into_iter();
+        let replayed = streams.map(|stream| {
+            let played: Vec<PlayedView<'_>> = stream.frames.iter().map(played).collect();
+            let replay = tracked.play(&played, InitialPose::Given);
+            (stream, replay)
+        });
+        let replayed = replayed.collect();
+
+        let baselines = Baselines::new(room.poses(), tracked.recording.features, &tracked.mapped);
+        let nearest = |view: usize| baselines.poses_for(views.features.row(view)).0;
+        scored(room, disturbance, replayed, &nearest)
     }
 }

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use nalgebra::{Quaternion, UnitQuaternion, Vector3, Vector4};
-use ndarray::{Array2, ArrayView2};
+use ndarray::{Array2, ArrayView1, ArrayView2};
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -314,7 +314,13 @@ impl<'a> Baselines<'a> {
     /// The pose of the most similar mapped frame, and the mean of the three most similar ones,
     /// weighted by the inverse fourth power of the distance between unit features.
     pub(super) fn poses_of(&self, row: usize) -> (Pose, Pose) {
-        let view = self.features.row(row);
+        self.poses_for(self.features.row(row))
+    }
+
+    /// The same for a view with this feature, of any length.
+    pub(super) fn poses_for(&self, feature: ArrayView1<'_, f32>) -> (Pose, Pose) {
+        let length = feature.dot(&feature).sqrt().max(1e-12);
+        let view = feature.mapv(|value| value / length);
         let mut similar: Vec<(f64, &Pose)> = self
             .mapped
             .iter()

@@ -62,14 +62,14 @@ pub struct RobustnessJson {
     rows: Vec<DisturbedTracking>,
     /// One row per disturbance and room.
     rooms: Vec<DisturbedTracking>,
-    adapter: String,
+    adapter: Option<String>,
     hold_out: &'static str,
 }
 
-/// Builds the JSON record of an evaluation with the named adapter.
+/// Builds the JSON record of an evaluation with the named adapter, or without one.
 pub fn robustness_json(
     found: &[DisturbedTracking],
-    adapter: &str,
+    adapter: Option<&str>,
     hold_out: HoldOut,
 ) -> RobustnessJson {
     let one = |room: &DisturbedTracking| DisturbedTracking {
@@ -80,7 +80,7 @@ pub fn robustness_json(
     RobustnessJson {
         rows: by_disturbance(found),
         rooms: found.iter().map(one).collect(),
-        adapter: adapter.to_owned(),
+        adapter: adapter.map(str::to_owned),
         hold_out: hold_out.name(),
     }
 }

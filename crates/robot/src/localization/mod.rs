@@ -11,7 +11,7 @@ mod camera_search;
 mod keypoint_room;
 
 pub use adapter_localizer::{AdapterEstimate, AdapterLocalizer};
-pub use camera_search::{focal_of_view, simple_camera};
+pub use camera_search::FocalSearch;
 pub use keypoint_room::{KeypointRoom, LocatedView, NotLocated};
 
 use nalgebra::Matrix6;

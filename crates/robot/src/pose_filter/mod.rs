@@ -40,7 +40,8 @@ pub struct FilterParameters {
     /// Number of consecutive located poses that must agree to start the tracking, or to replace a
     /// pose that they contradict.
     pub views_to_agree: u32,
-    /// Longest time between two such poses, seconds.
+    /// Longest time between two such poses, seconds. After a longer one, a pose that agrees with an
+    /// uncertain belief needs another one too.
     pub max_candidate_s: f64,
     /// Time without a located view after which a stream is DEGRADED, seconds.
     pub max_unlocated_s: f64,
@@ -205,8 +206,8 @@ impl PoseFilter {
 
     /// Corrects the step by a located pose.
     ///
-    /// Without a belief, or if the pose contradicts it, the pose supports a candidate. So it does if
-    /// the belief is uncertain: almost any pose agrees with it.
+    /// Without a belief, or if the pose contradicts it, the pose supports a candidate. So it does if no
+    /// view was located for a while and the belief is uncertain: almost any pose agrees with it.
     fn correct(
         &self,
         state: &mut FilterState,
@@ -218,7 +219,11 @@ impl PoseFilter {
         let parameters = &self.parameters;
         let earlier = state.candidate.take();
 
-        let is_certain = step.end().place().tells_a_place();
+        let seconds = |since: i64| frame.time_ns.abs_diff(since) as f64 * 1e-9;
+        let is_recent = state
+            .located_ns
+            .is_some_and(|located| seconds(located) <= parameters.max_candidate_s);
+        let is_certain = is_recent || step.end().place().tells_a_place();
         let surprise = surprise.filter(|_| is_certain).unwrap_or(f64::INFINITY);
         if surprise <= parameters.max_surprise {
             // Errors have heavier tails than a Gaussian.

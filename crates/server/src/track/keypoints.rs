@@ -6,20 +6,11 @@ use super::super::{Error, convert};
 use super::rooms::TrackedRoom;
 use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::{CameraIntrinsics, Pose};
-use seese3_core::keypoints::{KeypointSource, Keypoints};
+use seese3_core::keypoints::KeypointSource;
 use seese3_core::room::FrameId;
-use seese3_core::statistics::median;
-use seese3_robot::localization::{
-    KeypointRoom, LocatedView, NotLocated, focal_of_view, simple_camera,
-};
+use seese3_robot::localization::{FocalSearch, KeypointRoom, LocatedView, NotLocated};
 use seese3_robot::matched_views::ViewKeypoints;
 use seese3_robot::tracking::MatchedPose;
-
-/// Number of first views that are tried for an unknown focal length, and the period of later tries in
-/// views. A try takes some 100 ms for each room.
-const FIRST_TRIES: u32 = 5;
-/// Number of views with a focal length whose median is used.
-const VIEWS_OF_FOCAL: usize = 3;
 
 /// The camera of a stream.
 pub enum StreamCamera {
@@ -28,18 +19,7 @@ pub enum StreamCamera {
     /// The camera that mapped the room.
     Mapping,
     /// Estimated from the stream's views.
-    Estimated(CameraIntrinsics),
-    /// To be estimated.
     Unknown(FocalSearch),
-}
-
-/// The search for an unknown focal length.
-#[derive(Default)]
-pub struct FocalSearch {
-    /// Focal lengths of views, image widths.
-    focals: Vec<f64>,
-    /// Number of views so far.
-    views: u32,
 }
 
 /// What the images of a stream are matched with.
@@ -95,8 +75,8 @@ impl StreamCamera {
 
     /// Forgets an estimated camera.
     pub fn restart(&mut self) {
-        if matches!(self, Self::Estimated(_)) {
-            *self = Self::Unknown(FocalSearch::default());
+        if let Self::Unknown(search) = self {
+            *search = FocalSearch::default();
         }
     }
 
@@ -112,20 +92,27 @@ impl StreamCamera {
         rooms: &StreamRooms<'_>,
     ) -> Result<StreamMatch, Error> {
         let [width, height] = image.size;
-        if let Self::Unknown(search) = self {
-            match search.after(&image.keypoints, height as f64 / width as f64, rooms) {
-                Some(camera) => *self = Self::Estimated(camera),
-                None => return Ok(StreamMatch::default()),
+        let estimated = match self {
+            Self::Stated(_) | Self::Mapping => None,
+            Self::Unknown(search) => {
+                let height = height as f64 / width as f64;
+                let candidates = rooms.candidates().map(|(_, room)| room);
+                let camera = search.camera(&image.keypoints, height, candidates);
+                let Some(camera) = camera else {
+                    return Ok(StreamMatch::default());
+                };
+                Some(camera)
             }
-        }
+        };
 
         let is_only = rooms.candidates().count() == 1;
         let mut best: Option<(usize, LocatedView)> = None;
         let mut reasons = Vec::new();
         for (place, room) in rooms.candidates() {
             let camera = match self {
-                Self::Stated(camera) | Self::Estimated(camera) => *camera,
-                Self::Mapping | Self::Unknown(_) => room.map().camera,
+                Self::Stated(camera) => *camera,
+                Self::Mapping => room.map().camera,
+                Self::Unknown(_) => estimated.unwrap_or(room.map().camera),
             };
             match check_aspect(width, height, &camera) {
                 Ok(()) => {}
@@ -150,6 +137,10 @@ impl StreamCamera {
             }
         }
 
+        if let (Self::Unknown(search), Some(camera)) = (&mut *self, estimated) {
+            best = best.map(|(place, found)| (place, search.with_focal_of(&camera, found)));
+        }
+
         let novelty = |why: &NotLocated| match why {
             NotLocated::CameraContradicted { .. } => 0.0,
             other => other.novelty().unwrap_or(f64::INFINITY),
@@ -168,33 +159,5 @@ impl StreamCamera {
                 best_frame: FrameId(found.matched.best_frame() as u32),
             }),
         })
-    }
-}
-
-impl FocalSearch {
-    /// The camera, once enough views have a focal length. `height` is that of the image, image widths.
-    fn after(
-        &mut self,
-        keypoints: &Keypoints,
-        height: f64,
-        rooms: &StreamRooms<'_>,
-    ) -> Option<CameraIntrinsics> {
-        self.views = self.views.saturating_add(1);
-        if self.views > FIRST_TRIES && !self.views.is_multiple_of(FIRST_TRIES) {
-            return None;
-        }
-
-        let fits = rooms
-            .candidates()
-            .filter_map(|(_, room)| focal_of_view(room, keypoints, height));
-        let (focal, _) = fits.max_by_key(|(_, inliers)| *inliers)?;
-        self.focals.push(focal);
-        if self.focals.len() < VIEWS_OF_FOCAL {
-            return None;
-        }
-
-        let focal = median(&self.focals);
-        tracing::info!(focal, "focal length of a stream's camera, image widths");
-        simple_camera(focal, height).ok()
     }
 }

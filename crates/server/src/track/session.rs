@@ -43,6 +43,8 @@ pub struct Session {
     camera: StreamCamera,
     /// The last map pose while TRACKING, `world_from_camera`.
     last_pose: Option<Pose>,
+    /// Whether the last status was LOST.
+    is_lost: bool,
     key: TokenKey,
 }
 
@@ -160,6 +162,7 @@ impl Session {
             sensors,
             camera,
             last_pose: None,
+            is_lost: false,
             key: key.clone(),
         })
     }
@@ -332,6 +335,7 @@ impl Session {
         self.engine.reset();
         self.camera.restart();
         self.last_pose = None;
+        self.is_lost = false;
         self.answer(pb::track_response::Answer::Acknowledged(
             pb::TrackAcknowledged {},
         ))
@@ -344,6 +348,13 @@ impl Session {
         sources.find(|source| self.encoders.keypoint_encoder(source).is_some())
     }
 
+    /// The room in which views are matched; `None` for all rooms. A stream of keypoints that is LOST may
+    /// have been carried to another room.
+    fn room_to_match(&self) -> Option<usize> {
+        let is_lost = matches!(self.engine, Engine::Keypoints { .. }) && self.is_lost;
+        self.engine.room().filter(|_| !is_lost)
+    }
+
     /// Matches the keypoints of the stream's own image with its rooms.
     fn matched(&mut self, image: &ImageKeypoints) -> Result<StreamMatch, Error> {
         let Some(source) = self.keypoint_source().cloned() else {
@@ -352,7 +363,7 @@ impl Session {
         let rooms = StreamRooms {
             rooms: &self.rooms,
             source: &source,
-            room: self.engine.room(),
+            room: self.room_to_match(),
             predicted: self.last_pose,
         };
         self.camera.matched("frame.view.image", image, &rooms)
@@ -415,6 +426,7 @@ impl Session {
             .map_pose
             .filter(|_| update.status == Status::Tracking);
         self.last_pose = tracked.map(|tracked| tracked.pose);
+        self.is_lost = update.status == Status::Lost;
         Ok(match contradicted {
             Some(why) => Update {
                 reason: format!("{}; keypoints are not used: {why}", update.reason),

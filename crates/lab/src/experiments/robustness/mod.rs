@@ -11,7 +11,7 @@ use ndarray::ArrayView2;
 use serde::{Serialize, Serializer};
 
 use seese3_core::geometry::Pose;
-use seese3_core::room::FrameId;
+use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::HoldOut;
 use seese3_robot::tracking::{
     InitialPose, Observation, Played, Replay, Status, joined, period_ns, replay_frames,
@@ -129,8 +129,8 @@ fn down_of(poses: &[Pose]) -> Unit<Vector3<f64>> {
 }
 
 /// The tracked frames of a room under a hold-out, one list per stream.
-pub fn streams(room: &TrackedRoom<'_>, hold_out: HoldOut) -> Vec<Vec<FrameId>> {
-    let timeline = room.room().timeline();
+fn streams(room: &Room, hold_out: HoldOut) -> Vec<Vec<FrameId>> {
+    let timeline = room.timeline();
     hold_out
         .tracked(timeline)
         .chunk_by(|a, b| timeline.joins(*a, *b))
@@ -138,7 +138,99 @@ pub fn streams(room: &TrackedRoom<'_>, hold_out: HoldOut) -> Vec<Vec<FrameId>> {
         .collect()
 }
 
-/// Tracks the disturbed streams of a room.
+/// A stream of a disturbed camera.
+pub(super) struct PlannedStream {
+    /// The frames that the camera takes.
+    pub frames: Vec<PlannedFrame>,
+    /// Mean frame period of the recording, nanoseconds.
+    pub period_ns: i64,
+    /// Whether frames are scored: a stream of two frames may have no disturbed one.
+    is_scored: bool,
+}
+
+/// A frame of a disturbed stream.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct PlannedFrame {
+    /// The true pose of the disturbed camera, `world_from_camera`.
+    pub truth: Pose,
+    /// Row of the view among the tracked frames of the room.
+    pub view: usize,
+    pub time_ns: i64,
+    pub sequence: u64,
+    pub is_disturbed: bool,
+    is_scored: bool,
+}
+
+/// The disturbed streams of a room.
+pub(super) fn plan(room: &Room, hold_out: HoldOut, disturbance: Disturbance) -> Vec<PlannedStream> {
+    let mut planned = Vec::new();
+    let mut first_row = 0;
+    for frames in streams(room, hold_out) {
+        let part = Part::of(disturbance.extent(), frames.len());
+        let period_ns = period_ns(room, &frames);
+
+        let of_frame = |(number, frame): (usize, &FrameId)| {
+            let taken = taken(disturbance, part, number)?;
+            let since_first = frame.0 - frames[0].0;
+            Some(PlannedFrame {
+                truth: disturbance.truth(&room.poses()[frame.row()]),
+                view: first_row + taken.view,
+                time_ns: i64::from(since_first) * period_ns,
+                sequence: taken.own_number.unwrap_or(u64::from(since_first)),
+                is_disturbed: taken.is_disturbed,
+                is_scored: part.holds(number),
+            })
+        };
+        planned.push(PlannedStream {
+            frames: frames.iter().enumerate().filter_map(of_frame).collect(),
+            period_ns,
+            is_scored: part.begin < part.end,
+        });
+        first_row += frames.len();
+    }
+    planned
+}
+
+/// Scores the replays of planned streams. `nearest` returns the pose of the mapped frame that is most
+/// similar to a view, by its row among the tracked frames.
+pub(super) fn scored(
+    room: &Room,
+    disturbance: Disturbance,
+    replayed: Vec<(PlannedStream, Replay)>,
+    nearest: &dyn Fn(usize) -> Pose,
+) -> DisturbedTracking {
+    let mut replays = Vec::new();
+    let mut scored_rows = Vec::new();
+    let mut view_rows = Vec::new();
+    let mut noticed = Vec::new();
+    for (stream, replay) in replayed {
+        let is_scored: Vec<bool> = stream.frames.iter().map(|frame| frame.is_scored).collect();
+        if stream.is_scored {
+            noticed.push(noticed_after(&replay, &is_scored));
+        }
+        scored_rows.extend(is_scored);
+        view_rows.extend(stream.frames.iter().map(|frame| frame.view));
+        replays.push((replay, stream.period_ns));
+    }
+
+    let replay = joined(replays.into_iter());
+    let keep = |row: usize| scored_rows[row];
+    let share = |status| share_of(&replay, &scored_rows, status);
+    DisturbedTracking {
+        disturbance,
+        room: Some(room.id().to_string()),
+        frames: scored_rows.iter().filter(|&&scored| scored).count(),
+        scores: TrackingScores::of_rows(&replay, keep, |row| nearest(view_rows[row])),
+        statuses: StatusShares::of(share),
+        // The result is `None` if any stream stayed TRACKING.
+        noticed_after: match disturbance.extent() {
+            Extent::Whole => None,
+            Extent::Part => slowest(noticed.into_iter()),
+        },
+    }
+}
+
+/// Tracks the disturbed streams of a room by an adapter.
 ///
 /// # Errors
 /// [`Error::Adapter`] when the features are not those of the tracker's adapter.
@@ -152,73 +244,32 @@ pub fn evaluate(
     let latents = adapter.embed(views.features)?;
 
     let down = down_of(room.room().poses());
-    let mut replays = Vec::new();
-    let mut scored_rows = Vec::new();
-    let mut view_rows = Vec::new();
-    let mut noticed = Vec::new();
-    let mut first_row = 0;
-
-    for frames in streams(room, hold_out) {
-        let part = Part::of(disturbance.extent(), frames.len());
-        let period = period_ns(room.room(), &frames);
-
-        let mut played = Vec::new();
-        let mut is_scored = Vec::new();
-        for (number, frame) in frames.iter().enumerate() {
-            let Some(taken) = taken(disturbance, part, number) else {
-                continue;
-            };
-            let time_ns = i64::from(frame.0 - frames[0].0) * period;
-
-            let row = first_row + taken.view;
-            let truth = disturbance.truth(&room.room().poses()[frame.row()]);
-            played.push(Played {
-                frame: Observation {
-                    feature: Some(views.features.row(row).to_vec()),
-                    is_blank: taken.is_disturbed && views.is_blank[row],
-                    gravity: disturbance.gravity(&truth, down),
-                    ..Observation::new(
-                        time_ns,
-                        taken
-                            .own_number
-                            .unwrap_or_else(|| u64::from(frame.0 - frames[0].0)),
-                        latents.row(row).to_owned(),
-                    )
-                },
-                truth,
-            });
-            is_scored.push(part.holds(number));
-            view_rows.push(row);
-        }
-
-        let replay = replay_frames(room.tracker(), &played, InitialPose::Given);
-        // A stream of two frames has no disturbed frame.
-        if part.begin < part.end {
-            noticed.push(noticed_after(&replay, &is_scored));
-        }
-        scored_rows.extend(is_scored);
-        replays.push((replay, period));
-        first_row += frames.len();
-    }
-
-    let replay = joined(replays.into_iter());
-    let keep = |row: usize| scored_rows[row];
-    let share = |status| share_of(&replay, &scored_rows, status);
-
-    Ok(DisturbedTracking {
-        disturbance,
-        room: Some(room.room().id().to_string()),
-        frames: scored_rows.iter().filter(|&&scored| scored).count(),
-        scores: TrackingScores::of_rows(&replay, keep, |row| {
-            *room.most_alike(views.features.row(view_rows[row]))
-        }),
-        statuses: StatusShares::of(share),
-        // The result is `None` if any stream stayed TRACKING.
-        noticed_after: match disturbance.extent() {
-            Extent::Whole => None,
-            Extent::Part => slowest(noticed.into_iter()),
+    let played = |frame: &PlannedFrame| Played {
+        frame: Observation {
+            feature: Some(views.features.row(frame.view).to_vec()),
+            is_blank: frame.is_disturbed && views.is_blank[frame.view],
+            gravity: disturbance.gravity(&frame.truth, down),
+            ..Observation::new(
+                frame.time_ns,
+                frame.sequence,
+                latents.row(frame.view).to_owned(),
+            )
         },
-    })
+        truth: frame.truth,
+    };
+
+    let streams = plan(room.room(), hold_out, disturbance);
+    let replayed = streams.into_iter().map(|stream| {
+        let played: Vec<Played> = stream.frames.iter().map(played).collect();
+        let replay = replay_frames(room.tracker(), &played, InitialPose::Given);
+        (stream, replay)
+    });
+    Ok(scored(
+        room.room(),
+        disturbance,
+        replayed.collect(),
+        &|view| *room.most_alike(views.features.row(view)),
+    ))
 }
 
 /// A frame of the disturbed stream.
@@ -277,7 +328,7 @@ fn share_of(replay: &Replay, is_scored: &[bool], status: Status) -> f64 {
 /// The tracked frames with images changed by a disturbance. Each entry is the index among all
 /// tracked frames of the room and the index in the frame's stream.
 pub fn changed_images(
-    room: &TrackedRoom<'_>,
+    room: &Room,
     hold_out: HoldOut,
     disturbance: Disturbance,
 ) -> Vec<(usize, usize)> {
