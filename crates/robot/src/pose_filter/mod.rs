@@ -99,13 +99,14 @@ pub struct PoseFilter {
 }
 
 /// What a located pose did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Correction {
     /// It was not used: there is none, or it supports a candidate.
     Unused,
     /// It corrected the step.
     Applied,
-    /// It and earlier ones agree on this belief, which replaces that of the step.
-    Replaced(Belief),
+    /// It and earlier ones agree on another belief, which is now that of the state.
+    Replaced,
 }
 
 impl PoseFilter {
@@ -167,16 +168,13 @@ impl PoseFilter {
             Some(matched) => self.correct(state, &mut step, frame, matched, surprise),
             None => Correction::Unused,
         };
-        let is_used = !matches!(correction, Correction::Unused);
 
         // 3. Compose the odometry from the motions of the steps.
         let motion = step.motion();
         state.odom = state.odom.composed(&motion);
         let keyframe = state.keyframe_with(frame, &motion, self.parameters.keyframe_frames);
-        let belief = match correction {
-            Correction::Replaced(belief) => belief,
-            Correction::Unused | Correction::Applied => step.end(),
-        };
+        let replaced = state.belief.filter(|_| correction == Correction::Replaced);
+        let belief = replaced.unwrap_or_else(|| step.end());
         state.belief = Some(belief);
 
         // 4. Report.
@@ -197,7 +195,7 @@ impl PoseFilter {
             room: state.room,
             best_match: matched.map(|matched| (matched.room, matched.best_match())),
             best_camera: None,
-            match_used: is_used,
+            match_used: correction != Correction::Unused,
             surprise,
             candidate: state.candidate.as_ref().map(FilterCandidate::reported),
             anchors_needed: self.parameters.views_to_agree,
@@ -242,10 +240,11 @@ impl PoseFilter {
                 (belief, 1)
             });
         if agreeing >= parameters.views_to_agree {
+            state.belief = Some(belief);
             state.room = Some(matched.room);
             state.is_placed = true;
             state.located_ns = Some(frame.time_ns);
-            return Correction::Replaced(belief);
+            return Correction::Replaced;
         }
 
         state.candidate = Some(FilterCandidate {

@@ -123,11 +123,8 @@ impl Tracker {
                 continuity => continuity,
             },
         });
-        state.frames_off_map = if matches_room {
-            0
-        } else {
-            state.frames_off_map.saturating_add(1)
-        };
+        let off_map = state.frames_off_map.saturating_add(1);
+        state.frames_off_map = if matches_room { 0 } else { off_map };
 
         // 3. Dead reckoning: predict every pose from the motion since the keyframe.
         let reading = match sight {

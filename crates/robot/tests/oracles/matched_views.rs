@@ -2,13 +2,11 @@
 
 use std::sync::Arc;
 
-use nalgebra::{Matrix6, Point3, Vector3, Vector6};
-use seese3_core::geometry::{CameraIntrinsics, Pose, PoseError, log};
+use nalgebra::{Matrix6, Point3, Vector2, Vector3, Vector6};
+use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera, Pose, PoseError, log};
 use seese3_core::keypoints::Keypoints;
 use seese3_core::statistics::{Coverage, coverage};
-use seese3_robot::localization::{
-    KeypointRoom, LocatedView, NotLocated, focal_of_view, simple_camera,
-};
+use seese3_robot::localization::{FocalSearch, KeypointRoom, LocatedView, NotLocated};
 use seese3_robot::matched_views::{
     Error, KeypointMap, MapNoise, Mapping, MappingParameters, PoseInformation, Trial,
     TrialRecording, ViewKeypoints, fitted_noise, squared_length as squared_length_of,
@@ -532,21 +530,49 @@ fn a_wrong_focal_length_of_a_view_is_refused_by_name() {
     }
 }
 
-/// Oracle: the true focal length of the views, which have no distortion.
+/// Oracle: the true focal length of the views, which have no distortion. Three views determine it;
+/// located views refine it, and their uncertainty grows along the optical axis alone.
 #[test]
 fn the_focal_length_of_an_unknown_camera_is_estimated() {
     let world = World::exact();
     let room = world.room();
     for focal in [0.6, 0.77, 1.0, 1.4] {
-        let camera = simple_camera(focal, 0.75).unwrap();
-        for pose in new_poses(5) {
-            let view = world.scene.view(&pose, &camera, 0.0, &mut Random::new(8));
-            let found = focal_of_view(&room, &view.keypoints, camera.height());
-            near("focal", found.unwrap().0 / focal, 1.0, 0.03);
+        let truth = CameraIntrinsics::new(PixelCamera {
+            width: 1.0,
+            height: 0.75,
+            focal: Vector2::new(focal, focal),
+            center: None,
+            distortion: Distortion::None,
+        });
+        let truth = truth.unwrap();
+        let mut search = FocalSearch::default();
+        let mut answered = 0;
+        for pose in new_poses(8) {
+            let view = world.scene.view(&pose, &truth, 0.0, &mut Random::new(8));
+            let camera = search.camera(&view.keypoints, 0.75, std::iter::once(&room));
+            let Some(camera) = camera else {
+                continue;
+            };
+            near("focal", camera.focal().x / focal, 1.0, 0.03);
+            answered += 1;
+
+            let keypoints = &view.keypoints;
+            let located = room.locate(ViewKeypoints {
+                keypoints,
+                camera: &camera,
+            });
+            let located = located.unwrap();
+            let before = located.pose.covariance;
+            let added = search.with_focal_of(&camera, located).pose.covariance - before;
+            assert!(added[(2, 2)] > 0.0);
+            near("elsewhere", added.norm(), added[(2, 2)], 1e-12);
         }
+        assert_eq!(answered, 6, "the third view and the later ones");
     }
 
-    assert!(focal_of_view(&room, &Keypoints::default(), 0.75).is_none());
+    let mut search = FocalSearch::default();
+    let none = search.camera(&Keypoints::default(), 0.75, std::iter::once(&room));
+    assert!(none.is_none());
 }
 
 /// A trial with the given information; its error is drawn from Student's t distribution with 5 degrees

@@ -137,7 +137,7 @@ fn an_exact_motion_of_another_sensor_replaces_the_prior() {
 fn two_located_views_start_the_tracking() {
     let filter = filter();
     let mut state = filter.start(None);
-    let mut observe =
+    let observe =
         |state: &mut FilterState, number, pose| filter.observe(state, &view(number, pose)).unwrap();
 
     assert_eq!(observe(&mut state, 0, None).status, Status::Lost);

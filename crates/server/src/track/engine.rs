@@ -10,19 +10,19 @@ use seese3_robot::tracking::{PoseWithCovariance, State, Tracker};
 /// A tracker with the state of its stream.
 pub enum Engine {
     /// By latents of an adapter, and by keypoints where a room has some.
-    Adapter { tracker: Tracker, state: State },
+    Adapter { tracker: Tracker, state: Box<State> },
     /// By keypoints alone.
     Keypoints {
         filter: PoseFilter,
-        state: FilterState,
+        state: Box<FilterState>,
     },
 }
 
 /// The state of a stream, as a token holds it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub enum EngineState {
-    Adapter(State),
-    Keypoints(FilterState),
+    Adapter(Box<State>),
+    Keypoints(Box<FilterState>),
 }
 
 impl Engine {
@@ -38,7 +38,7 @@ impl Engine {
             FilterRoom::of(&tracked.room, &mapped)
         };
         let filter = PoseFilter::new(rooms.iter().map(room).collect(), parameters)?;
-        let state = filter.start(initial);
+        let state = Box::new(filter.start(initial));
         Some(Self::Keypoints { filter, state })
     }
 
@@ -61,8 +61,8 @@ impl Engine {
     /// Forgets everything about the camera.
     pub fn reset(&mut self) {
         match self {
-            Self::Adapter { tracker, state } => *state = tracker.start(None),
-            Self::Keypoints { filter, state } => *state = filter.start(None),
+            Self::Adapter { tracker, state } => **state = tracker.start(None),
+            Self::Keypoints { filter, state } => **state = filter.start(None),
         }
     }
 
@@ -96,18 +96,20 @@ impl EngineState {
     /// The rooms that the state refers to.
     pub fn rooms(&mut self) -> impl Iterator<Item = &mut usize> {
         let (room, candidate) = match self {
-            Self::Adapter(State {
-                room, candidate, ..
-            }) => (
-                room,
-                candidate.as_mut().map(|candidate| &mut candidate.room),
-            ),
-            Self::Keypoints(FilterState {
-                room, candidate, ..
-            }) => (
-                room,
-                candidate.as_mut().map(|candidate| &mut candidate.room),
-            ),
+            Self::Adapter(state) => {
+                let candidate = state.candidate.as_mut();
+                (
+                    &mut state.room,
+                    candidate.map(|candidate| &mut candidate.room),
+                )
+            }
+            Self::Keypoints(state) => {
+                let candidate = state.candidate.as_mut();
+                (
+                    &mut state.room,
+                    candidate.map(|candidate| &mut candidate.room),
+                )
+            }
         };
         room.iter_mut().chain(candidate)
     }

@@ -246,7 +246,7 @@ mod tests {
             let sealed = Sealed {
                 config: Vec::new(),
                 adapter: Vec::new(),
-                state: EngineState::Adapter(state),
+                state: EngineState::Adapter(Box::new(state)),
                 rooms: Vec::new(),
             };
             let bytes = sealed.to_bytes();

@@ -147,7 +147,7 @@ impl Session {
                 let settings = settings(&config, &served[0].adapter.adapter)?;
                 let tracker = Tracker::new(maps(&served)?, settings)
                     .map_err(|error| Error::Precondition(error.to_string()))?;
-                let state = tracker.start(begins);
+                let state = Box::new(tracker.start(begins));
                 let rooms = served.into_iter().map(TrackedRoom::under).collect();
                 (rooms, Engine::Adapter { tracker, state })
             }
