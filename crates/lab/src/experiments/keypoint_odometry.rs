@@ -252,6 +252,7 @@ impl<'a> TrackedRoom<'a> {
             novelty,
             unlocated,
             fingerprint: (!view.keypoints.is_empty()).then_some(view.fingerprint),
+            measured: None,
         }
     }
 }

@@ -1,32 +1,39 @@
-//! A Gaussian on a camera's pose, its velocity and the lasting part of localization errors.
+//! A Gaussian on a camera's pose, its velocity, and the lasting errors of its sensors.
 
-use nalgebra::{Cholesky, Matrix6, SMatrix, SVector, Vector6};
+use nalgebra::{Cholesky, Matrix6, SMatrix, SVector, Vector4, Vector6};
 
 use super::FilterParameters;
-use crate::tracking::{MotionPrior, PoseWithCovariance};
+use crate::tracking::{Drift, MotionPrior, PoseWithCovariance};
 use seese3_core::geometry::{Pose, Twist, adjoint, exp, left_jacobian_inverse, log};
 
-const STATE: usize = 18;
-const JOINT: usize = 24;
+const STATE: usize = 22;
+const JOINT: usize = 28;
 type StateMatrix = SMatrix<f64, STATE, STATE>;
 type JointMatrix = SMatrix<f64, JOINT, JOINT>;
 type Observed = SMatrix<f64, 6, JOINT>;
+
+/// Independent noise of a motion by wheel odometry, standard deviations per axis.
+const DRIVEN_NOISE_M: f64 = 1e-3;
+const DRIVEN_NOISE_RAD: f64 = 5e-4;
 
 /// Rows of the blocks of the state.
 const POSE: usize = 0;
 const VELOCITY: usize = 6;
 const LASTING: usize = 12;
+const WHEELS: usize = 18;
 
 /// Rows of the blocks of [`Step`].
 const START: usize = 0;
 const MOTION: usize = 6;
 const END_VELOCITY: usize = 12;
 const END_LASTING: usize = 18;
+const END_WHEELS: usize = 24;
 
-/// Pose, velocity and lasting error, with the covariance of their errors.
+/// Pose, velocity, and the lasting errors of located poses and of wheel odometry, with the covariance
+/// of the errors of all four.
 ///
 /// The pose error δ is in the body frame, true = pose · exp(δ), ordered (v, ω), in meters and
-/// radians. The lasting error is that of located poses, in standard deviations of each pose.
+/// radians.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Belief {
@@ -34,9 +41,12 @@ pub struct Belief {
     pub pose: Pose,
     /// In the camera's body frame, meters and radians per second.
     pub velocity: Twist,
-    /// Lasting error of located poses, in standard deviations.
+    /// Lasting error of located poses, in standard deviations of each pose.
     pub lasting: Vector6<f64>,
-    /// Of (pose, velocity, lasting error); symmetric and positive definite.
+    /// Errors of the length and of the rotations about three axes of wheel odometry, in standard
+    /// deviations of its drift.
+    pub wheels: Vector4<f64>,
+    /// Of (pose, velocity, lasting error, wheel error); symmetric and positive definite.
     #[cfg_attr(
         feature = "serde",
         serde(with = "seese3_core::matrices::upper_triangle")
@@ -51,8 +61,8 @@ pub fn origin() -> PoseWithCovariance {
 
 /// The belief over one step of time, while observations are added.
 ///
-/// The error state is (initial pose, motion, final velocity, final lasting error). The motion's
-/// error is in the final body frame.
+/// The error state is (initial pose, motion, final velocity, final lasting error, wheel error). The
+/// motion's error is in the final body frame.
 pub struct Step {
     /// The initial pose.
     start: Pose,
@@ -60,6 +70,7 @@ pub struct Step {
     motion: Pose,
     velocity: Vector6<f64>,
     lasting: Vector6<f64>,
+    wheels: Vector4<f64>,
     /// Estimated error state.
     change: SVector<f64, JOINT>,
     covariance: JointMatrix,
@@ -90,11 +101,15 @@ impl Belief {
         block(LASTING, POSE, &scale.transpose());
         block(VELOCITY, VELOCITY, &prior.velocity_covariance());
         block(LASTING, LASTING, &Matrix6::identity());
+        covariance
+            .fixed_view_mut::<4, 4>(WHEELS, WHEELS)
+            .fill_with_identity();
 
         Self {
             pose: place.pose,
             velocity: Twist::default(),
             lasting: Vector6::zeros(),
+            wheels: Vector4::zeros(),
             covariance,
         }
     }
@@ -128,11 +143,14 @@ impl Belief {
             spread[(END_VELOCITY + axis, VELOCITY + axis)] = drift.left[part];
             spread[(END_LASTING + axis, LASTING + axis)] = lasts;
         }
+        for error in 0..4 {
+            spread[(END_WHEELS + error, WHEELS + error)] = 1.0;
+        }
 
         let mut covariance = spread * self.covariance * spread.transpose();
         let mut of_drift = covariance.fixed_view_mut::<12, 12>(MOTION, MOTION);
         of_drift += drift.noise * parameters.abruptness;
-        for axis in END_LASTING..JOINT {
+        for axis in END_LASTING..END_WHEELS {
             covariance[(axis, axis)] += 1.0 - lasts * lasts;
         }
 
@@ -141,6 +159,7 @@ impl Belief {
             motion: exp(&drift.motion),
             velocity: drift.velocity.to_vector(),
             lasting: self.lasting * lasts,
+            wheels: self.wheels,
             change: SVector::zeros(),
             covariance,
         }
@@ -175,16 +194,33 @@ impl Step {
         }
     }
 
-    /// The observation of the motion by another sensor, `start_from_end`.
-    pub fn moved(&self, motion: &PoseWithCovariance) -> Observation {
+    /// The observation of the motion by wheel odometry, `start_from_end`.
+    ///
+    /// The drift is a constant error of the length, and constant errors of the rotations by angle and
+    /// by way, as those of a wrong wheel radius or track.
+    pub fn driven(&self, motion: &Pose, drift: &Drift) -> Observation {
+        let Twist { linear, angular } = log(motion);
         let mut derivative = Observed::zeros();
         derivative
             .fixed_view_mut::<6, 6>(0, MOTION)
             .fill_with_identity();
+        let mut of_wheels = SMatrix::<f64, 6, 4>::zeros();
+        of_wheels
+            .fixed_view_mut::<3, 1>(0, 0)
+            .copy_from(&(linear * drift.translation_share));
+        let rotation = drift.rotation_share * (angular.norm() + linear.norm());
+        of_wheels
+            .fixed_view_mut::<3, 3>(3, 1)
+            .fill_diagonal(rotation);
+        derivative
+            .fixed_view_mut::<6, 4>(0, END_WHEELS)
+            .copy_from(&of_wheels);
+
+        let [v, w] = [DRIVEN_NOISE_M, DRIVEN_NOISE_RAD].map(|deviation| deviation * deviation);
         Observation {
-            residual: log(&self.motion.inv_mul(&motion.pose)).to_vector(),
+            residual: log(&self.motion.inv_mul(motion)).to_vector() - of_wheels * self.wheels,
             derivative,
-            noise: motion.covariance,
+            noise: Matrix6::from_diagonal(&Vector6::new(v, v, v, w, w, w)),
         }
     }
 
@@ -241,12 +277,16 @@ impl Step {
             merged[(VELOCITY + axis, END_VELOCITY + axis)] = 1.0;
             merged[(LASTING + axis, END_LASTING + axis)] = 1.0;
         }
+        for error in 0..4 {
+            merged[(WHEELS + error, END_WHEELS + error)] = 1.0;
+        }
         let covariance = merged * self.covariance * merged.transpose();
 
         Belief {
             pose: start * motion,
             velocity: Twist::from_vector(&(self.velocity + part(END_VELOCITY))),
             lasting: self.lasting + part(END_LASTING),
+            wheels: self.wheels + self.change.fixed_rows::<4>(END_WHEELS),
             covariance: (covariance + covariance.transpose()) * 0.5,
         }
     }

@@ -153,12 +153,17 @@ impl PoseFilter {
     ) -> Result<Update, Refusal> {
         let seconds = state.seconds_to(frame)?;
         let is_first = state.last.is_none();
+        let driven = frame.measured.zip(state.driven_to(frame));
         state.advance(frame);
 
         // 1. Predict. The room's prior holds; before the room is known, that of the first one.
         let prior = &self.rooms[state.room.unwrap_or(0)].motion_prior;
         let belief = state.belief.unwrap_or_else(|| Belief::at_origin(prior));
         let mut step = belief.step(prior, seconds, &self.parameters);
+        if let Some((measured, motion)) = driven {
+            step.update(&step.driven(&motion, &measured.drift), 1.0);
+            state.driven = state.driven.and(log(&motion));
+        }
 
         // 2. Correct. An identical image holds nothing new.
         let is_new = self.parameters.fuse && state.unchanged_frames == 0;
@@ -186,7 +191,7 @@ impl PoseFilter {
             is_keyframe: state
                 .keyframe
                 .is_some_and(|now| now.sequence == frame.sequence),
-            odom: state.odom,
+            odom: state.odom_with_drift(frame),
             map_pose: state.is_placed.then(|| belief.place()),
             velocity: (!is_first).then_some(belief.velocity),
             status,

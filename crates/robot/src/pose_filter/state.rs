@@ -1,8 +1,13 @@
 //! Input and state of a filter.
 
+use nalgebra::Matrix6;
+
 use super::Belief;
 use super::belief::origin;
-use crate::tracking::{Candidate, MatchedPose, PoseWithCovariance, Refusal};
+use crate::tracking::{
+    Candidate, MatchedPose, MeasuredPose, OdometryDelta, PoseWithCovariance, Refusal,
+};
+use seese3_core::geometry::{Pose, log};
 
 /// One frame of a stream.
 #[derive(Debug, Clone, PartialEq)]
@@ -19,6 +24,8 @@ pub struct ViewObservation {
     pub unlocated: String,
     /// Hash of the view's keypoints: equal for identical images. `None` without keypoints.
     pub fingerprint: Option<u64>,
+    /// Camera pose from wheel odometry, in the odometry frame of that sensor.
+    pub measured: Option<MeasuredPose>,
 }
 
 /// Complete state of a stream.
@@ -33,8 +40,10 @@ pub struct FilterState {
     pub belief: Option<Belief>,
     /// Whether the belief is in the room.
     pub is_placed: bool,
-    /// `odom_from_camera`.
+    /// `odom_from_camera`, without the drift of wheel odometry in its covariance.
     pub odom: PoseWithCovariance,
+    /// Wheel odometry since the start of the stream, for that drift.
+    pub driven: OdometryDelta,
     /// The keyframe of reported motions.
     pub keyframe: Option<KeyframeMark>,
     /// A belief that a located pose supports, but not enough of them.
@@ -55,6 +64,8 @@ pub struct LastView {
     pub sequence: u64,
     /// Hash of the view's keypoints; `None` without keypoints.
     pub fingerprint: Option<u64>,
+    /// Camera pose from wheel odometry, if the frame has one.
+    pub measured: Option<Pose>,
 }
 
 /// The keyframe of reported motions.
@@ -92,6 +103,7 @@ impl FilterState {
             belief: None,
             is_placed: false,
             odom: origin(),
+            driven: OdometryDelta::zero(),
             keyframe: None,
             candidate: None,
             located_ns: None,
@@ -122,6 +134,24 @@ impl FilterState {
         Ok(frame.time_ns.abs_diff(last.time_ns) as f64 * 1e-9)
     }
 
+    /// The motion since the last frame by wheel odometry, `last_from_this`, if both frames have it.
+    pub(super) fn driven_to(&self, frame: &ViewObservation) -> Option<Pose> {
+        let motion = self.last?.measured?.inv_mul(&frame.measured?.pose);
+        log(&motion).is_unique_logarithm().then_some(motion)
+    }
+
+    /// `odom_from_camera`. The drift of wheel odometry is one error of the whole way, which the
+    /// composed covariance of the steps leaves out.
+    pub(super) fn odom_with_drift(&self, frame: &ViewObservation) -> PoseWithCovariance {
+        let drift = frame
+            .measured
+            .map(|measured| measured.drift.over(self.driven));
+        PoseWithCovariance {
+            covariance: self.odom.covariance + drift.unwrap_or_else(Matrix6::zeros),
+            ..self.odom
+        }
+    }
+
     /// Makes a frame the last one, and counts identical images.
     pub(super) fn advance(&mut self, frame: &ViewObservation) {
         let is_unchanged = self.last.is_some_and(|last| {
@@ -136,6 +166,7 @@ impl FilterState {
             time_ns: frame.time_ns,
             sequence: frame.sequence,
             fingerprint: frame.fingerprint,
+            measured: frame.measured.map(|measured| measured.pose),
         });
 
         // A pose that was set before the first frame holds at this one.

@@ -142,7 +142,7 @@ impl OdometryAccumulator {
 
 impl OdometryDelta {
     /// The delta from a frame to itself.
-    fn zero() -> Self {
+    pub(crate) fn zero() -> Self {
         Self {
             pose: Pose::identity(),
             way_m: 0.0,
@@ -150,7 +150,7 @@ impl OdometryDelta {
         }
     }
 
-    fn and(self, motion: Twist) -> Self {
+    pub(crate) fn and(self, motion: Twist) -> Self {
         Self {
             pose: self.pose * exp(&motion),
             way_m: self.way_m + motion.linear.norm(),
@@ -162,7 +162,7 @@ impl OdometryDelta {
 impl Drift {
     /// Covariance of the error of an odometry delta, on (v, ω) in the later camera's body frame.
     /// The mean of a linearly growing heading error is half its final value, hence the factor 0.5.
-    fn over(self, driven: OdometryDelta) -> Matrix6<f64> {
+    pub(crate) fn over(self, driven: OdometryDelta) -> Matrix6<f64> {
         let OdometryDelta {
             way_m, turns_rad, ..
         } = driven;

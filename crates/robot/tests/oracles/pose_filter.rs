@@ -1,6 +1,6 @@
 //! The filter of located poses.
 
-use nalgebra::{Matrix6, Vector3};
+use nalgebra::Vector3;
 
 use seese3_core::geometry::{Pose, PoseError, Twist, body_twist, exp};
 use seese3_core::room::FrameId;
@@ -8,7 +8,7 @@ use seese3_robot::pose_filter::{
     Belief, FilterParameters, FilterRoom, FilterState, PoseFilter, ViewObservation,
 };
 use seese3_robot::tracking::{
-    MatchedPose, MotionPrior, PoseWithCovariance, Refusal, Status, Update,
+    Drift, MatchedPose, MeasuredPose, MotionPrior, PoseWithCovariance, Refusal, Status, Update,
 };
 
 const PERIOD_NS: i64 = 33_333_333;
@@ -50,6 +50,7 @@ fn view(number: u64, pose: Option<Pose>) -> ViewObservation {
             "too few keypoints".to_owned()
         },
         fingerprint: Some(number),
+        measured: None,
     }
 }
 
@@ -109,26 +110,51 @@ fn lasting_errors_cancel_in_a_motion() {
     assert!(step.end().place().covariance[(0, 0)] > 0.9 * 4e-4);
 }
 
-/// Oracle: without observations, the closed form of the prior (tested in `pose_velocity.rs`): of a
-/// known pose and velocity variance σ², the displacement after t has at least the variance
-/// (σ τ (1 − e^(−t/τ)))².
+/// Oracle: wheels with an error of 4 % of the length, which is what their drift of 5 % allows. While
+/// views are located, the filter learns the error; then the wheels alone carry the pose, and the
+/// variance of a straight way of 2 m is at most that of 5 % of its length.
 #[test]
-fn an_exact_motion_of_another_sensor_replaces_the_prior() {
-    let prior = MotionPrior::assumed();
-    let parameters = FilterParameters::default();
-    let belief = Belief::at(&located(Pose::identity(), 0.1), &prior, 0.0);
-    let mut step = belief.step(&prior, 0.1, &parameters);
-    let reach = 0.5 * 0.5 * (1.0 - (-0.1_f64 / 0.5).exp());
-    assert!(step.motion().covariance[(0, 0)] > reach * reach);
-
-    let motion = PoseWithCovariance {
-        pose: path(9),
-        covariance: Matrix6::identity() * 1e-14,
+fn wheels_carry_the_pose_and_their_error_is_learned() {
+    let filter = filter();
+    let drift = Drift {
+        translation_share: 0.05,
+        rotation_share: 0.01,
     };
-    step.update(&step.moved(&motion), 1.0);
-    assert!(PoseError::between(&step.end().pose, &path(9)).translation_m < 1e-6);
-    let variance = step.end().place().covariance[(0, 0)];
-    assert!((variance / 1e-2 - 1.0).abs() < 0.1, "{variance}");
+    let at = |number: u64, scale: f64| Pose::translation(0.0, 0.0, 0.01 * number as f64 * scale);
+    let driven = |number: u64, is_located: bool| ViewObservation {
+        measured: Some(MeasuredPose {
+            pose: Pose::translation(7.0, 1.0, 0.0) * at(number, 1.04),
+            drift,
+        }),
+        ..view(number, is_located.then(|| at(number, 1.0)))
+    };
+
+    // Never located: the reported odometry is that of the wheels.
+    let mut state = filter.start(None);
+    for number in 0..200 {
+        filter.observe(&mut state, &driven(number, false)).unwrap();
+    }
+    let update = filter.observe(&mut state, &driven(200, false)).unwrap();
+    let length = update.odom.pose.translation.vector.z;
+    assert!((length - 2.08).abs() < 0.02, "{length}");
+    let deviation = update.odom.covariance[(2, 2)].sqrt();
+    assert!(deviation > 0.1 && deviation < 0.2, "{deviation}");
+
+    // Located for 3 m, then not for 2 m.
+    let mut state = filter.start(None);
+    for number in 0..300 {
+        filter.observe(&mut state, &driven(number, true)).unwrap();
+    }
+    let learned = state.belief.unwrap().wheels[0];
+    assert!((learned - 0.8).abs() < 0.2, "{learned}");
+    for number in 300..500 {
+        filter.observe(&mut state, &driven(number, false)).unwrap();
+    }
+    let update = filter.observe(&mut state, &driven(500, false)).unwrap();
+    let error = error_m(&update, &at(500, 1.0));
+    assert!(error < 0.03, "{error}");
+    let deviation = update.map_pose.unwrap().covariance[(2, 2)].sqrt();
+    assert!(deviation < 0.1 && deviation > 0.5 * error, "{deviation}");
 }
 
 /// Oracle: the contract: two located views that agree start the tracking, at the true pose, with the

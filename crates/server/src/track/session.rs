@@ -24,7 +24,7 @@ use seese3_core::keypoints::{KeypointSource, Keypoints};
 use seese3_robot::localization::NotLocated;
 use seese3_robot::pose_filter::ViewObservation;
 use seese3_robot::tracking::{
-    Observation, OtherView, PoseWithCovariance, Refusal, Status, Tracker, Update,
+    MeasuredPose, Observation, OtherView, PoseWithCovariance, Refusal, Status, Tracker, Update,
 };
 
 const FIELD: &str = "config";
@@ -468,10 +468,7 @@ impl Session {
         let other_views = self
             .encoded_other_views(other_views)
             .map_err(refused(Reason::View))?;
-        let measured = odometry
-            .map(|given| self.frames.measured(given))
-            .transpose()
-            .map_err(|error| refused(Reason::Odometry)(error.within("frame.odometry")))?;
+        let measured = self.measured(odometry)?;
         let gravity = gravity
             .map(|given| self.sensors.gravity(&given))
             .transpose()
@@ -506,9 +503,6 @@ impl Session {
             let problem = "needs an adapter that can track in this room; leave it out";
             refused(reason)(Error::invalid(field, problem))
         };
-        if frame.odometry.is_some() {
-            return Err(unused(Reason::Odometry, "frame.odometry"));
-        }
         if frame.gravity.is_some() {
             return Err(unused(Reason::Gravity, "frame.gravity"));
         }
@@ -516,6 +510,7 @@ impl Session {
             return Err(unused(Reason::View, "frame.other_views"));
         }
 
+        let measured = self.measured(frame.odometry)?;
         let image = self.detected(frame.view).map_err(refused(Reason::View))?;
         let matched = self.matched(&image).map_err(refused(Reason::View))?;
         let why_not = matched.why_not;
@@ -537,12 +532,24 @@ impl Session {
             novelty,
             unlocated,
             fingerprint: image.fingerprint(),
+            measured,
         };
 
         let Engine::Keypoints { filter, state } = &mut self.engine else {
             return Err(Refused::Server(Error::Internal));
         };
         Ok((filter.observe(state, &observation)?, None))
+    }
+
+    /// The camera pose of another sensor's odometry.
+    fn measured(
+        &self,
+        odometry: Option<pb::MeasuredOdometry>,
+    ) -> Result<Option<MeasuredPose>, Refused> {
+        odometry
+            .map(|given| self.frames.measured(given))
+            .transpose()
+            .map_err(|error| refused(Reason::Odometry)(error.within("frame.odometry")))
     }
 
     /// The keypoints of an image, for a stream without an adapter.
