@@ -682,13 +682,14 @@ class Encoding:
 class TrackStart:
     """What a tracking stream was opened with, the server's choices included.
 
+    - `adapter`: None if the stream tracks by matched keypoints alone.
     - `room`: None if it is not known yet, and the camera has to be found.
     - `keyframe_displacement`, `keyframe_frames`: a new keyframe is taken after a motion of this norm, metres and
       radians mixed, and after the time of so many frames.
     - `calibration_rooms`: in how many rooms the covariances were calibrated.
     """
 
-    adapter: Revision
+    adapter: Revision | None
     room: Revision | None
     keyframe_displacement: float | None
     keyframe_frames: int | None
@@ -697,7 +698,7 @@ class TrackStart:
     @classmethod
     def of(cls, message: odometry_pb2.TrackStarted) -> TrackStart:
         return cls(
-            Revision.of(message.adapter),
+            _revision(message, "adapter"),
             _revision(message, "room"),
             _known(message.keyframes, "displacement"),
             _known(message.keyframes, "frames"),

@@ -130,7 +130,8 @@ def test_newer_frames_that_take_the_place_of_older_ones_are_counted(client: sees
     frames = [(row * PERIOD_NS, feature) for row, feature in enumerate(rows)]
     with client.track(seese3.TrackConfig(room=ROOM, newest_only=True)) as track:
         answers = list(track.follow(iter(frames), ahead=64))
-        assert track.start is not None and track.start.adapter.name == "robot"
+        assert track.start is not None and track.start.adapter is not None
+        assert track.start.adapter.name == "robot"
     refused = sum(one.frames for one in answers if isinstance(one, seese3.TrackRefusal))
     assert refused + sum(isinstance(one, seese3.TrackUpdate) for one in answers) == len(frames)
     assert answers[-1].sequence == len(frames)
