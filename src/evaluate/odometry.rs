@@ -145,12 +145,12 @@ impl Odometry {
                 keypoint_odometry::evaluate(&recordings, self.hold_out, parameters, done)
             })
         })?;
-        self.report(
-            &tracked,
-            "matched keypoints, no adapter",
-            "fused with located views",
-            None,
-        )
+        let how = if self.no_fusion {
+            "dead reckoning"
+        } else {
+            "fused with located views"
+        };
+        self.report(&tracked, "matched keypoints, no adapter", how, None)
     }
 
     /// Evaluates with a progress bar. Paths are written as each room completes; the first failure

@@ -1,20 +1,24 @@
 //! A Gaussian on a camera's pose, its velocity, and the lasting errors of its sensors.
 
-use nalgebra::{Cholesky, Matrix6, SMatrix, SVector, Vector4, Vector6};
+use nalgebra::{Cholesky, Matrix6, SMatrix, SVector, Vector6};
 
 use super::FilterParameters;
 use crate::tracking::{Drift, MotionPrior, PoseWithCovariance};
 use seese3_core::geometry::{Pose, Twist, adjoint, exp, left_jacobian_inverse, log};
 
-const STATE: usize = 22;
-const JOINT: usize = 28;
+const STATE: usize = 23;
+const JOINT: usize = 29;
+/// Number of wheel errors.
+const WHEEL_ERRORS: usize = 5;
 type StateMatrix = SMatrix<f64, STATE, STATE>;
 type JointMatrix = SMatrix<f64, JOINT, JOINT>;
 type Observed = SMatrix<f64, 6, JOINT>;
 
-/// Independent noise of a motion by wheel odometry, standard deviations per axis.
-const DRIVEN_NOISE_M: f64 = 1e-3;
-const DRIVEN_NOISE_RAD: f64 = 5e-4;
+/// Independent noise of a motion by wheel odometry: standard deviations per axis at rest, and over 1 m.
+const DRIVEN_FLOOR_M: f64 = 5e-4;
+const DRIVEN_FLOOR_RAD: f64 = 5e-4;
+const DRIVEN_NOISE_M: f64 = 1e-2;
+const DRIVEN_NOISE_RAD: f64 = 5e-3;
 
 /// Rows of the blocks of the state.
 const POSE: usize = 0;
@@ -43,9 +47,9 @@ pub struct Belief {
     pub velocity: Twist,
     /// Lasting error of located poses, in standard deviations of each pose.
     pub lasting: Vector6<f64>,
-    /// Errors of the length and of the rotations about three axes of wheel odometry, in standard
-    /// deviations of its drift.
-    pub wheels: Vector4<f64>,
+    /// Errors of wheel odometry, in standard deviations of its drift: scale of the translations, scale
+    /// of the rotations, and rotation about each axis per meter.
+    pub wheels: SVector<f64, WHEEL_ERRORS>,
     /// Of (pose, velocity, lasting error, wheel error); symmetric and positive definite.
     #[cfg_attr(
         feature = "serde",
@@ -70,7 +74,7 @@ pub struct Step {
     motion: Pose,
     velocity: Vector6<f64>,
     lasting: Vector6<f64>,
-    wheels: Vector4<f64>,
+    wheels: SVector<f64, WHEEL_ERRORS>,
     /// Estimated error state.
     change: SVector<f64, JOINT>,
     covariance: JointMatrix,
@@ -102,14 +106,14 @@ impl Belief {
         block(VELOCITY, VELOCITY, &prior.velocity_covariance());
         block(LASTING, LASTING, &Matrix6::identity());
         covariance
-            .fixed_view_mut::<4, 4>(WHEELS, WHEELS)
+            .fixed_view_mut::<WHEEL_ERRORS, WHEEL_ERRORS>(WHEELS, WHEELS)
             .fill_with_identity();
 
         Self {
             pose: place.pose,
             velocity: Twist::default(),
             lasting: Vector6::zeros(),
-            wheels: Vector4::zeros(),
+            wheels: SVector::zeros(),
             covariance,
         }
     }
@@ -143,7 +147,7 @@ impl Belief {
             spread[(END_VELOCITY + axis, VELOCITY + axis)] = drift.left[part];
             spread[(END_LASTING + axis, LASTING + axis)] = lasts;
         }
-        for error in 0..4 {
+        for error in 0..WHEEL_ERRORS {
             spread[(END_WHEELS + error, WHEELS + error)] = 1.0;
         }
 
@@ -196,31 +200,38 @@ impl Step {
 
     /// The observation of the motion by wheel odometry, `start_from_end`.
     ///
-    /// The drift is a constant error of the length, and constant errors of the rotations by angle and
-    /// by way, as those of a wrong wheel radius or track.
+    /// The drift is a scale error of translations, a scale error of rotations, and a rotation per meter
+    /// forward, as those of a wrong wheel radius, a wrong track width and unequal wheels. The optical
+    /// axis points forward.
     pub fn driven(&self, motion: &Pose, drift: &Drift) -> Observation {
         let Twist { linear, angular } = log(motion);
+        let distance_m = linear.norm();
+        let mut of_wheels = SMatrix::<f64, 6, WHEEL_ERRORS>::zeros();
+        of_wheels
+            .fixed_view_mut::<3, 1>(0, 0)
+            .copy_from(&(linear * drift.translation_share));
+        of_wheels
+            .fixed_view_mut::<3, 1>(3, 1)
+            .copy_from(&(angular * drift.rotation_share));
+        of_wheels
+            .fixed_view_mut::<3, 3>(3, 2)
+            .fill_diagonal(drift.rotation_share * distance_m * linear.z.signum());
+
         let mut derivative = Observed::zeros();
         derivative
             .fixed_view_mut::<6, 6>(0, MOTION)
             .fill_with_identity();
-        let mut of_wheels = SMatrix::<f64, 6, 4>::zeros();
-        of_wheels
-            .fixed_view_mut::<3, 1>(0, 0)
-            .copy_from(&(linear * drift.translation_share));
-        let rotation = drift.rotation_share * (angular.norm() + linear.norm());
-        of_wheels
-            .fixed_view_mut::<3, 3>(3, 1)
-            .fill_diagonal(rotation);
         derivative
-            .fixed_view_mut::<6, 4>(0, END_WHEELS)
+            .fixed_view_mut::<6, WHEEL_ERRORS>(0, END_WHEELS)
             .copy_from(&of_wheels);
 
-        let [v, w] = [DRIVEN_NOISE_M, DRIVEN_NOISE_RAD].map(|deviation| deviation * deviation);
+        let v = DRIVEN_FLOOR_M.powi(2) + DRIVEN_NOISE_M.powi(2) * distance_m;
+        let w = DRIVEN_FLOOR_RAD.powi(2) + DRIVEN_NOISE_RAD.powi(2) * distance_m;
+        let noise = Matrix6::from_diagonal(&Vector6::new(v, v, v, w, w, w));
         Observation {
             residual: log(&self.motion.inv_mul(motion)).to_vector() - of_wheels * self.wheels,
             derivative,
-            noise: Matrix6::from_diagonal(&Vector6::new(v, v, v, w, w, w)),
+            noise,
         }
     }
 
@@ -277,7 +288,7 @@ impl Step {
             merged[(VELOCITY + axis, END_VELOCITY + axis)] = 1.0;
             merged[(LASTING + axis, END_LASTING + axis)] = 1.0;
         }
-        for error in 0..4 {
+        for error in 0..WHEEL_ERRORS {
             merged[(WHEELS + error, END_WHEELS + error)] = 1.0;
         }
         let covariance = merged * self.covariance * merged.transpose();
@@ -286,7 +297,7 @@ impl Step {
             pose: start * motion,
             velocity: Twist::from_vector(&(self.velocity + part(END_VELOCITY))),
             lasting: self.lasting + part(END_LASTING),
-            wheels: self.wheels + self.change.fixed_rows::<4>(END_WHEELS),
+            wheels: self.wheels + self.change.fixed_rows::<WHEEL_ERRORS>(END_WHEELS),
             covariance: (covariance + covariance.transpose()) * 0.5,
         }
     }

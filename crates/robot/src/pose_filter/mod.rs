@@ -4,8 +4,8 @@
 //! keypoints, see [`crate::matched_views`].
 //!
 //! - The filter is stateless: all data of a stream are in its [`FilterState`].
-//! - Errors of located poses are a lasting part, which several views of one place share, and an
-//!   independent part; see [`Belief`]. The filter does not average the lasting part out.
+//! - The error of a located pose is the sum of a time-correlated part and white noise; see [`Belief`].
+//!   The filter does not average the correlated part out.
 //! - A located pose that contradicts the belief is not used. Two in a row that agree replace it.
 //! - `odom_from_camera` composes the motions of the steps, in which lasting errors cancel. It is
 //!   continuous and drifts.
@@ -15,9 +15,13 @@ mod state;
 mod status;
 
 pub use belief::Belief;
-pub use state::{FilterCandidate, FilterState, KeyframeMark, LastView, ViewObservation};
+pub use state::{
+    FilterCandidate, FilterState, KeyframeMark, LastView, OdometryMark, ViewObservation,
+};
 
-use crate::tracking::{MatchedPose, MotionPrior, PoseWithCovariance, Refusal, Update, extent_m};
+use crate::tracking::{
+    MatchedPose, MotionPrior, PoseWithCovariance, Refusal, Status, Update, extent_m,
+};
 use belief::{Step, twist_covariance};
 use seese3_core::geometry::log;
 use seese3_core::room::{FrameId, Room};
@@ -155,8 +159,9 @@ impl PoseFilter {
         let is_first = state.last.is_none();
         let driven = frame.measured.zip(state.driven_to(frame));
         state.advance(frame);
+        state.expire_candidate(frame, self.parameters.max_candidate_s);
 
-        // 1. Predict. The room's prior holds; before the room is known, that of the first one.
+        // 1. Predict, by the motion prior of the room, or of the first room while it is unknown.
         let prior = &self.rooms[state.room.unwrap_or(0)].motion_prior;
         let belief = state.belief.unwrap_or_else(|| Belief::at_origin(prior));
         let mut step = belief.step(prior, seconds, &self.parameters);
@@ -177,6 +182,7 @@ impl PoseFilter {
         // 3. Compose the odometry from the motions of the steps.
         let motion = step.motion();
         state.odom = state.odom.composed(&motion);
+        state.mark_measured(frame);
         let keyframe = state.keyframe_with(frame, &motion, self.parameters.keyframe_frames);
         let replaced = state.belief.filter(|_| correction == Correction::Replaced);
         let belief = replaced.unwrap_or_else(|| step.end());
@@ -184,6 +190,8 @@ impl PoseFilter {
 
         // 4. Report.
         let (status, reason) = self.status(state, frame);
+        // A camera that is lost among several rooms has to be found again.
+        let is_somewhere = status == Status::Lost && self.rooms.len() > 1;
         Ok(Update {
             motion: log(&keyframe.since.pose),
             motion_covariance: twist_covariance(&keyframe.since),
@@ -191,13 +199,13 @@ impl PoseFilter {
             is_keyframe: state
                 .keyframe
                 .is_some_and(|now| now.sequence == frame.sequence),
-            odom: state.odom_with_drift(frame),
-            map_pose: state.is_placed.then(|| belief.place()),
+            odom: state.odom_with_drift(),
+            map_pose: (state.is_placed && !is_somewhere).then(|| belief.place()),
             velocity: (!is_first).then_some(belief.velocity),
             status,
             reason,
             out_of_distribution: frame.novelty,
-            room: state.room,
+            room: state.room.filter(|_| !is_somewhere),
             best_match: matched.map(|matched| (matched.room, matched.best_match())),
             best_camera: None,
             match_used: correction != Correction::Unused,

@@ -5,7 +5,7 @@ use nalgebra::Matrix6;
 use super::Belief;
 use super::belief::origin;
 use crate::tracking::{
-    Candidate, MatchedPose, MeasuredPose, OdometryDelta, PoseWithCovariance, Refusal,
+    Candidate, Drift, MatchedPose, MeasuredPose, OdometryDelta, PoseWithCovariance, Refusal,
 };
 use seese3_core::geometry::{Pose, log};
 
@@ -44,6 +44,8 @@ pub struct FilterState {
     pub odom: PoseWithCovariance,
     /// Wheel odometry since the start of the stream, for that drift.
     pub driven: OdometryDelta,
+    /// The last frame with wheel odometry.
+    pub measured: Option<OdometryMark>,
     /// The keyframe of reported motions.
     pub keyframe: Option<KeyframeMark>,
     /// A belief that a located pose supports, but not enough of them.
@@ -64,8 +66,6 @@ pub struct LastView {
     pub sequence: u64,
     /// Hash of the view's keypoints; `None` without keypoints.
     pub fingerprint: Option<u64>,
-    /// Camera pose from wheel odometry, if the frame has one.
-    pub measured: Option<Pose>,
 }
 
 /// The keyframe of reported motions.
@@ -78,7 +78,21 @@ pub struct KeyframeMark {
     pub since: PoseWithCovariance,
 }
 
-/// A belief that located poses support, but not enough of them.
+/// The last frame with wheel odometry.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct OdometryMark {
+    /// Camera pose in the sensor's odometry frame.
+    pub pose: Pose,
+    /// Whether it is the last frame of the stream.
+    pub is_last: bool,
+    /// The drift that the sensor states.
+    pub translation_share: f64,
+    /// The same for rotations.
+    pub rotation_share: f64,
+}
+
+/// A hypothesis with too few agreeing poses.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct FilterCandidate {
@@ -104,6 +118,7 @@ impl FilterState {
             is_placed: false,
             odom: origin(),
             driven: OdometryDelta::zero(),
+            measured: None,
             keyframe: None,
             candidate: None,
             located_ns: None,
@@ -119,16 +134,16 @@ impl FilterState {
         let Some(last) = self.last else {
             return Ok(0.0);
         };
-        if frame.time_ns <= last.time_ns {
-            return Err(Refusal::Late {
-                time_ns: frame.time_ns,
-                last_ns: last.time_ns,
-            });
-        }
         if frame.sequence <= last.sequence {
             return Err(Refusal::Duplicate {
                 sequence: frame.sequence,
                 last: last.sequence,
+            });
+        }
+        if frame.time_ns <= last.time_ns {
+            return Err(Refusal::Late {
+                time_ns: frame.time_ns,
+                last_ns: last.time_ns,
             });
         }
         Ok(frame.time_ns.abs_diff(last.time_ns) as f64 * 1e-9)
@@ -136,20 +151,48 @@ impl FilterState {
 
     /// The motion since the last frame by wheel odometry, `last_from_this`, if both frames have it.
     pub(super) fn driven_to(&self, frame: &ViewObservation) -> Option<Pose> {
-        let motion = self.last?.measured?.inv_mul(&frame.measured?.pose);
+        let measured = self.measured.filter(|mark| mark.is_last)?;
+        let motion = measured.pose.inv_mul(&frame.measured?.pose);
         log(&motion).is_unique_logarithm().then_some(motion)
     }
 
-    /// `odom_from_camera`. The drift of wheel odometry is one error of the whole way, which the
-    /// composed covariance of the steps leaves out.
-    pub(super) fn odom_with_drift(&self, frame: &ViewObservation) -> PoseWithCovariance {
-        let drift = frame
-            .measured
-            .map(|measured| measured.drift.over(self.driven));
+    /// Remembers the odometry of a frame.
+    pub(super) fn mark_measured(&mut self, frame: &ViewObservation) {
+        let now = frame.measured.map(|measured| OdometryMark {
+            pose: measured.pose,
+            is_last: true,
+            translation_share: measured.drift.translation_share,
+            rotation_share: measured.drift.rotation_share,
+        });
+        let before = self.measured.map(|mark| OdometryMark {
+            is_last: false,
+            ..mark
+        });
+        self.measured = now.or(before);
+    }
+
+    /// `odom_from_camera`. Odometry drift is fully correlated between steps, and `composed` assumes
+    /// independence, so the drift is added here.
+    pub(super) fn odom_with_drift(&self) -> PoseWithCovariance {
+        let drift = self.measured.map_or_else(Matrix6::zeros, |mark| {
+            let drift = Drift {
+                translation_share: mark.translation_share,
+                rotation_share: mark.rotation_share,
+            };
+            drift.over(self.driven)
+        });
         PoseWithCovariance {
-            covariance: self.odom.covariance + drift.unwrap_or_else(Matrix6::zeros),
+            covariance: self.odom.covariance + drift,
             ..self.odom
         }
+    }
+
+    /// Drops a candidate that no located pose has supported for too long.
+    pub(super) fn expire_candidate(&mut self, frame: &ViewObservation, max_s: f64) {
+        let is_old = |candidate: &FilterCandidate| {
+            frame.time_ns.abs_diff(candidate.time_ns) as f64 * 1e-9 > max_s
+        };
+        self.candidate = self.candidate.filter(|candidate| !is_old(candidate));
     }
 
     /// Makes a frame the last one, and counts identical images.
@@ -166,10 +209,9 @@ impl FilterState {
             time_ns: frame.time_ns,
             sequence: frame.sequence,
             fingerprint: frame.fingerprint,
-            measured: frame.measured.map(|measured| measured.pose),
         });
 
-        // A pose that was set before the first frame holds at this one.
+        // A pose set before the first frame counts as located at the first frame.
         if self.is_placed {
             self.located_ns.get_or_insert(frame.time_ns);
         }

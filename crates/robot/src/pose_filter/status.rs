@@ -77,7 +77,11 @@ impl PoseFilter {
             .located_ns
             .map_or(0.0, |located| frame.time_ns.abs_diff(located) as f64 * 1e-9);
         (unlocated_s > parameters.max_unlocated_s).then(|| {
-            let why = why_unlocated(frame);
+            let why = if parameters.fuse {
+                why_unlocated(frame)
+            } else {
+                "corrections are disabled".to_owned()
+            };
             format!("no view has been located for {unlocated_s:.1} s: {why}")
         })
     }

@@ -24,6 +24,8 @@ pub struct TrackedRoom {
     pub keypoints: Option<ServedKeypoints>,
     /// The room under the stream's adapter; `None` for a stream without an adapter.
     pub served: Option<Arc<ServedNavigator>>,
+    /// SHA-256 of all frames, see [`frames_content`].
+    content: [u8; 32],
 }
 
 impl TrackedRoom {
@@ -33,6 +35,7 @@ impl TrackedRoom {
             revision: convert::room_revision(&served),
             room: served.navigator.room().clone(),
             keypoints: served.keypoints.clone(),
+            content: served.content.frames,
             served: Some(served),
         }
     }
@@ -47,6 +50,7 @@ impl TrackedRoom {
             revision: super::super::localization::room_to_wire(served),
             room: loaded.room.clone(),
             keypoints: loaded.keypoints.clone(),
+            content: frames_content(&loaded.room, None, loaded.room.frame_count()),
             served: None,
         })
     }
@@ -69,13 +73,12 @@ impl TrackedRoom {
             return None;
         }
 
-        Some(match &self.served {
-            Some(served) if frame_count == self.room.frame_count() => served.content.frames,
-            Some(served) => {
-                frames_content(&self.room, Some(served.navigator.latents()), frame_count)
-            }
-            None => frames_content(&self.room, None, frame_count),
-        })
+        if frame_count == self.room.frame_count() {
+            return Some(self.content);
+        }
+        let served = self.served.as_ref();
+        let latents = served.map(|served| served.navigator.latents());
+        Some(frames_content(&self.room, latents, frame_count))
     }
 
     /// A stored frame as a wire message.
@@ -88,9 +91,11 @@ impl TrackedRoom {
     }
 }
 
-/// The rooms of a stream that tracks by keypoints alone; `None` if an adapter is to be used: the
-/// configuration names one, an adapter can track in these rooms, or not all of them have keypoints
-/// that this server can detect.
+/// The rooms of a stream that tracks by keypoints alone. `None` if an adapter is to be used:
+///
+/// - The configuration names one.
+/// - An adapter can track in these rooms, unless the stream `was_of_keypoints` before it resumed.
+/// - Not all of the rooms have keypoints that this server can detect.
 ///
 /// # Errors
 /// [`Error::NotFound`] or [`Error::Invalid`] on the rooms; [`Error::Precondition`] if a named room
@@ -98,13 +103,15 @@ impl TrackedRoom {
 pub fn rooms_with_keypoints(
     snapshot: &Snapshot,
     config: &pb::TrackConfig,
+    was_of_keypoints: bool,
 ) -> Result<Option<Vec<TrackedRoom>>, Error> {
     let named = match config.room.as_str() {
         "" => config.rooms.clone(),
         room => vec![room.to_owned()],
     };
     let is_both = !config.room.is_empty() && !config.rooms.is_empty();
-    if is_both || !config.adapter.is_empty() || can_track(snapshot, &named) {
+    let is_by_adapter = !was_of_keypoints && can_track(snapshot, &named);
+    if is_both || !config.adapter.is_empty() || is_by_adapter {
         return Ok(None);
     }
 

@@ -103,6 +103,11 @@ impl Sealed {
         pb::TrackConfig::decode(self.config.as_slice()).map_err(|_| Error::Internal)
     }
 
+    /// Whether the stream tracks by keypoints alone.
+    pub fn is_of_keypoints(&self) -> bool {
+        matches!(self.state, EngineState::Keypoints(_))
+    }
+
     /// The state with its room indices mapped to `rooms`; `None` if the adapter or a room differs
     /// from the token's.
     pub fn opened_in(self, rooms: &[TrackedRoom]) -> Option<EngineState> {

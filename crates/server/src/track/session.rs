@@ -60,7 +60,8 @@ impl Session {
         key: &TokenKey,
     ) -> Result<Self, Error> {
         if config.resume_token.is_empty() {
-            return Self::configured(snapshot, config, key).map_err(|error| error.within(FIELD));
+            return Self::configured(snapshot, config, key, false)
+                .map_err(|error| error.within(FIELD));
         }
 
         let field = format!("{FIELD}.resume_token");
@@ -82,12 +83,13 @@ impl Session {
         let sealed = Sealed::from_bytes(key.open(&field, &config.resume_token)?)?;
         let config = sealed.config()?;
 
-        let mut session = Self::configured(snapshot, config, key).map_err(|error| match error {
-            Error::NotFound { name, .. } => {
-                Error::Precondition(format!("{field}: '{name}' is not served here"))
-            }
-            other => other,
-        })?;
+        let mut session = Self::configured(snapshot, config, key, sealed.is_of_keypoints())
+            .map_err(|error| match error {
+                Error::NotFound { name, .. } => {
+                    Error::Precondition(format!("{field}: '{name}' is not served here"))
+                }
+                other => other,
+            })?;
 
         // The state's latents and poses are valid only with the same adapter and rooms.
         let state = sealed.opened_in(&session.rooms).ok_or_else(|| {
@@ -108,6 +110,7 @@ impl Session {
         snapshot: &Arc<Snapshot>,
         config: pb::TrackConfig,
         key: &TokenKey,
+        was_of_keypoints: bool,
     ) -> Result<Self, Error> {
         // Validate everything before the stream starts.
         let frames = StreamFrames::of(&config)?;
@@ -136,7 +139,7 @@ impl Session {
             ));
         }
 
-        let (rooms, engine) = match rooms_with_keypoints(snapshot, &config)? {
+        let (rooms, engine) = match rooms_with_keypoints(snapshot, &config, was_of_keypoints)? {
             Some(rooms) => {
                 let parameters = parameters(&config)?;
                 let engine = Engine::of_keypoints(&rooms, parameters, begins.as_ref());
