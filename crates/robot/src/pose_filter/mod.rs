@@ -67,7 +67,7 @@ impl Default for FilterParameters {
             gate: 16.81,
             max_surprise: 67.24,
             views_to_agree: 2,
-            max_candidate_s: 1.0,
+            max_candidate_s: 5.0,
             max_unlocated_s: 0.35,
             max_unchanged_frames: 5,
             keyframe_frames: 30,

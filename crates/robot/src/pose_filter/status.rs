@@ -23,10 +23,16 @@ impl PoseFilter {
 
         match self.doubt(state, frame, &place) {
             Some(reason) => (Status::Degraded, reason),
-            None => (
-                Status::Tracking,
-                "recent views are located by their keypoints".to_owned(),
-            ),
+            None => {
+                let reason = if !self.parameters.fuse {
+                    "the client has set the pose, and it is still certain"
+                } else if frame.unlocated.is_empty() {
+                    "recent views are located by their keypoints"
+                } else {
+                    "a view was located, or the client has set the pose, a moment ago"
+                };
+                (Status::Tracking, reason.to_owned())
+            }
         }
     }
 

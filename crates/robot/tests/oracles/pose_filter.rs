@@ -249,7 +249,7 @@ fn one_outlier_is_ignored_and_two_that_agree_are_believed() {
         .observe(&mut state, &view(12, Some(elsewhere)))
         .unwrap();
     assert!(outlier.candidate.is_some());
-    let later = filter.observe(&mut state, &view(45, None)).unwrap();
+    let later = filter.observe(&mut state, &view(170, None)).unwrap();
     assert!(later.candidate.is_none());
 
     let mut state = filter.start(None);
@@ -304,6 +304,23 @@ fn frozen_images_and_late_frames_are_noticed() {
     let duplicate = filter.observe(&mut state, &duplicate);
     assert!(matches!(duplicate, Err(Refusal::Duplicate { .. })));
     assert_eq!(state, before);
+}
+
+/// Oracle: the contract: cameras down to one image in five seconds are tracked.
+#[test]
+fn slow_cameras_are_tracked() {
+    let filter = filter();
+    let mut state = filter.start(None);
+    let slow = |number: u64| ViewObservation {
+        time_ns: number as i64 * 4_000_000_000,
+        ..view(number, Some(path(number)))
+    };
+    filter.observe(&mut state, &slow(0)).unwrap();
+    for number in 1..10 {
+        let update = filter.observe(&mut state, &slow(number)).unwrap();
+        assert_eq!(update.status, Status::Tracking, "{}", update.reason);
+        assert!(error_m(&update, &path(number)) < 0.02);
+    }
 }
 
 /// Oracle: the contract: a pose that the client sets is believed until views contradict it.

@@ -43,6 +43,39 @@ pub struct StreamMatch {
     pub why_not: Option<NotLocated>,
 }
 
+/// Number of contradicted views from which a stated camera is not believed.
+const MIN_CONTRADICTED: u32 = 3;
+
+/// How many views of a stream agree with its stated camera.
+#[derive(Default)]
+pub struct CameraVotes {
+    located: u32,
+    contradicted: u32,
+    /// The last contradiction.
+    last: Option<NotLocated>,
+}
+
+impl CameraVotes {
+    /// Counts a match, and withdraws its pose if most views contradict the camera: views far from the
+    /// map do not determine their focal length, and would be located at a wrong place.
+    pub fn judged(&mut self, found: StreamMatch) -> StreamMatch {
+        self.located += u32::from(found.pose.is_some());
+        if let Some(why) = found.why_not.filter(NotLocated::is_of_camera) {
+            self.contradicted += 1;
+            self.last = Some(why);
+        }
+
+        let is_wrong = self.contradicted >= MIN_CONTRADICTED && self.contradicted > self.located;
+        if is_wrong && found.pose.is_some() {
+            return StreamMatch {
+                pose: None,
+                why_not: self.last,
+            };
+        }
+        found
+    }
+}
+
 impl StreamRooms<'_> {
     /// The rooms to match, with their indices.
     fn candidates(&self) -> impl Iterator<Item = (usize, &KeypointRoom)> {
@@ -71,6 +104,11 @@ impl StreamCamera {
             (None, true) => Ok(Self::Mapping),
             (None, false) => Ok(Self::Unknown(FocalSearch::default())),
         }
+    }
+
+    /// Whether the camera is estimated, not stated.
+    pub fn is_estimated(&self) -> bool {
+        matches!(self, Self::Unknown(_))
     }
 
     /// Forgets an estimated camera.

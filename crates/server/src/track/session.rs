@@ -11,7 +11,7 @@ use super::super::snapshot::Snapshot;
 use super::Overtaken;
 use super::configuration::{StreamFrames, back_pressure, is_fused, parameters, rooms, settings};
 use super::engine::Engine;
-use super::keypoints::{StreamCamera, StreamMatch, StreamRooms};
+use super::keypoints::{CameraVotes, StreamCamera, StreamMatch, StreamRooms};
 use super::rooms::{TrackedRoom, rooms_with_keypoints};
 use super::sealed::Sealed;
 use super::sensors::Sensors;
@@ -41,6 +41,7 @@ pub struct Session {
     frames: StreamFrames,
     sensors: Sensors,
     camera: StreamCamera,
+    camera_votes: CameraVotes,
     /// The last map pose while TRACKING, `world_from_camera`.
     last_pose: Option<Pose>,
     /// Whether the last status was LOST.
@@ -164,6 +165,7 @@ impl Session {
             frames,
             sensors,
             camera,
+            camera_votes: CameraVotes::default(),
             last_pose: None,
             is_lost: false,
             key: key.clone(),
@@ -337,6 +339,7 @@ impl Session {
     pub fn reset(&mut self) -> pb::TrackResponse {
         self.engine.reset();
         self.camera.restart();
+        self.camera_votes = CameraVotes::default();
         self.last_pose = None;
         self.is_lost = false;
         self.answer(pb::track_response::Answer::Acknowledged(
@@ -369,7 +372,12 @@ impl Session {
             room: self.room_to_match(),
             predicted: self.last_pose,
         };
-        self.camera.matched("frame.view.image", image, &rooms)
+        let found = self.camera.matched("frame.view.image", image, &rooms)?;
+        Ok(if self.camera.is_estimated() {
+            found
+        } else {
+            self.camera_votes.judged(found)
+        })
     }
 
     /// An embedder of images, features and latents for the stream's adapter, which also detects
