@@ -75,8 +75,6 @@ pub struct Step {
     velocity: Vector6<f64>,
     lasting: Vector6<f64>,
     wheels: SVector<f64, WHEEL_ERRORS>,
-    /// Estimated error state.
-    change: SVector<f64, JOINT>,
     covariance: JointMatrix,
 }
 
@@ -164,7 +162,6 @@ impl Belief {
             velocity: drift.velocity.to_vector(),
             lasting: self.lasting * lasts,
             wheels: self.wheels,
-            change: SVector::zeros(),
             covariance,
         }
     }
@@ -238,13 +235,13 @@ impl Step {
     /// Squared Mahalanobis length of the innovation: χ² with six degrees of freedom if all
     /// covariances are correct. Infinite if the sum of the covariances is not positive definite.
     pub fn surprise(&self, observed: &Observation) -> f64 {
-        let innovation = self.innovation(observed);
+        let innovation = observed.residual;
         let sum = Cholesky::new(self.innovation_covariance(observed));
         sum.map_or(f64::INFINITY, |sum| innovation.dot(&sum.solve(&innovation)))
     }
 
-    /// Kalman update; `factor` is on the covariance of the observation's noise. Nothing changes if the
-    /// sum of the covariances is not positive definite.
+    /// Kalman update; `factor` is on the covariance of the observation's noise. The observation is one
+    /// of the current state. Nothing changes if the sum of the covariances is not positive definite.
     pub fn update(&mut self, observed: &Observation, factor: f64) {
         let observed = Observation {
             noise: observed.noise * factor,
@@ -254,7 +251,13 @@ impl Step {
             return;
         };
         let gain = self.covariance * observed.derivative.transpose() * sum.inverse();
-        self.change += gain * self.innovation(&observed);
+        let change = gain * observed.residual;
+        let part = |at: usize| change.fixed_rows::<6>(at).into_owned();
+        self.start *= exp(&Twist::from_vector(&part(START)));
+        self.motion *= exp(&Twist::from_vector(&part(MOTION)));
+        self.velocity += part(END_VELOCITY);
+        self.lasting += part(END_LASTING);
+        self.wheels += change.fixed_rows::<WHEEL_ERRORS>(END_WHEELS);
 
         // Joseph's form: (I − K H) P (I − K H)ᵀ + K R Kᵀ.
         let rest = JointMatrix::identity() - gain * observed.derivative;
@@ -262,27 +265,22 @@ impl Step {
             rest * self.covariance * rest.transpose() + gain * observed.noise * gain.transpose();
     }
 
-    /// The motion of the step, `start_from_end`. Errors of located poses that last cancel in it.
+    /// The motion of the step, `start_from_end`. Time-correlated errors of located poses cancel in it.
     pub fn motion(&self) -> PoseWithCovariance {
-        let error = self.change.fixed_rows::<6>(MOTION).into_owned();
         let covariance = self.covariance.fixed_view::<6, 6>(MOTION, MOTION);
         PoseWithCovariance {
-            pose: self.motion * exp(&Twist::from_vector(&error)),
+            pose: self.motion,
             covariance: covariance.into_owned(),
         }
     }
 
     /// The state after the step.
     pub fn end(&self) -> Belief {
-        let part = |at: usize| self.change.fixed_rows::<6>(at).into_owned();
-        let start = self.start * exp(&Twist::from_vector(&part(START)));
-        let motion = self.motion().pose;
-
         // The final pose error is the initial one in the new body frame, plus the motion's.
         let mut merged = SMatrix::<f64, STATE, JOINT>::zeros();
         merged
             .fixed_view_mut::<6, 6>(POSE, START)
-            .copy_from(&adjoint(&motion.inverse()));
+            .copy_from(&adjoint(&self.motion.inverse()));
         for axis in 0..6 {
             merged[(POSE + axis, MOTION + axis)] = 1.0;
             merged[(VELOCITY + axis, END_VELOCITY + axis)] = 1.0;
@@ -294,16 +292,12 @@ impl Step {
         let covariance = merged * self.covariance * merged.transpose();
 
         Belief {
-            pose: start * motion,
-            velocity: Twist::from_vector(&(self.velocity + part(END_VELOCITY))),
-            lasting: self.lasting + part(END_LASTING),
-            wheels: self.wheels + self.change.fixed_rows::<WHEEL_ERRORS>(END_WHEELS),
+            pose: self.start * self.motion,
+            velocity: Twist::from_vector(&self.velocity),
+            lasting: self.lasting,
+            wheels: self.wheels,
             covariance: (covariance + covariance.transpose()) * 0.5,
         }
-    }
-
-    fn innovation(&self, observed: &Observation) -> Vector6<f64> {
-        observed.residual - observed.derivative * self.change
     }
 
     fn innovation_covariance(&self, observed: &Observation) -> Matrix6<f64> {

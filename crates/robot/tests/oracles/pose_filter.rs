@@ -110,6 +110,38 @@ fn lasting_errors_cancel_in_a_motion() {
     assert!(step.end().place().covariance[(0, 0)] > 0.9 * 4e-4);
 }
 
+/// Oracle: by hand. A camera that is uncertain along its x axis alone turns by 90° about z: x is then
+/// its −y axis. A pose that is located there moves it along that axis alone.
+#[test]
+fn errors_turn_with_the_camera() {
+    let prior = MotionPrior::assumed();
+    let parameters = parameters(0.0, 1.0);
+    let mut place = located(Pose::identity(), 1e-4);
+    place.covariance[(0, 0)] = 1e-2;
+    let turn = Pose::rotation(Vector3::z() * std::f64::consts::FRAC_PI_2);
+
+    let composed = place.composed(&located(turn, 1e-4));
+    assert!((composed.covariance[(1, 1)] - 1e-2).abs() < 1e-5);
+    assert!(composed.covariance[(0, 0)] < 1e-5);
+
+    let drift = Drift {
+        translation_share: 1e-4,
+        rotation_share: 1e-4,
+    };
+    let mut step = Belief::at(&place, &prior, 0.0).step(&prior, 0.1, &parameters);
+    step.update(&step.driven(&turn, &drift), 1.0);
+    let end = step.end().place();
+    assert!((end.covariance[(1, 1)] - 1e-2).abs() < 1e-4, "{end:?}");
+    assert!(end.covariance[(0, 0)] < 1e-4);
+
+    // Located 2 cm along both of its axes, with the variance that y has: y moves by half of it.
+    let seen = located(turn * Pose::translation(0.02, 0.02, 0.0), 0.1);
+    step.update(&step.located(&seen, &parameters), 1.0);
+    let moved = turn.inverse() * step.end().pose.translation.vector;
+    assert!((moved.y - 0.01).abs() < 1e-3, "{moved}");
+    assert!(moved.x.abs() < 1e-3, "{moved}");
+}
+
 /// Oracle: wheels whose translations are 4 % and whose rotations are 5 % too large, at drifts of 5 %,
 /// on a way that turns left and right. While views are located, the filter learns both errors; then the wheels alone carry the pose.
 #[test]
