@@ -16,6 +16,10 @@ use seese3_data::pose_check::{
 };
 use seese3_encoder::{image_size, read_image};
 
+/// Ratio of the median epipolar errors of the stated and the fitted camera from which the fitted one
+/// is suggested.
+const BETTER_CAMERA_RATIO: f64 = 1.1;
+
 /// Origin of the poses that are compared with the images.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PosesFrom {
@@ -215,6 +219,10 @@ fn camera_text(fit: &Result<FittedCamera, CameraFitError>) -> String {
     }
 
     let with_stated = match fitted.stated_median_px {
+        Some(stated_px) if stated_px > BETTER_CAMERA_RATIO * median_px => format!(
+            "{stated_px:.2} with the stated camera; better: {}",
+            camera_flag(fitted)
+        ),
         Some(stated_px) => format!("{stated_px:.2} with the stated camera"),
         None => format!("no camera is stated: {}", camera_flag(fitted)),
     };

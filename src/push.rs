@@ -125,10 +125,6 @@ impl Push {
         };
 
         let keypoints = match &stored.keypoints {
-            Some(_) if self.extend => {
-                say("the keypoints stay behind: frames that extend a room have none");
-                None
-            }
             Some(keypoints) => Some(keypoints_upload(stored, keypoints)?),
             None => None,
         };

@@ -11,8 +11,9 @@ use super::{
 };
 use crate::folder_of;
 use seese3_core::Cause;
-use seese3_core::features::Features;
+use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::Pose;
+use seese3_core::keypoints::KeypointSource;
 use seese3_core::room::{Frames, Provenance, Room};
 use seese3_robot::matched_views::MappedKeypoints;
 
@@ -48,28 +49,27 @@ impl Store {
             .await
     }
 
-    /// Appends the frames of `addition`, with `features`, to the newest revision of the room of the
-    /// same name. Publishes nothing.
+    /// Appends the frames of `addition`, with their features and keypoints, to the newest revision of
+    /// the room of the same name. Publishes nothing.
     ///
     /// The added frames are separate sequences. The result has no image paths, because the added
-    /// frames have none.
+    /// frames have none. Known frames keep their keypoints.
     ///
     /// # Errors
     /// [`Error::Unknown`] if there is no such room, [`Error::CannotAdd`] if the frames are not
     /// compatible with its own, otherwise as [`check_features`] and [`Store::load_room`].
     pub async fn extended_room(
         &self,
-        addition: &Room,
-        features: &[Features],
+        addition: RoomContents<'_>,
         others: OtherFeatures,
     ) -> Result<ExtendedRoom, Error> {
-        check_features(addition, features)?;
-        let name = addition.id().as_str();
+        check_features(addition.room, addition.features)?;
+        let name = addition.room.id().as_str();
         let folder = folder_of(Kind::Room, name);
         let newest = self.revisions(&folder).await?.present.last().copied();
         let base = self.load_room(name, newest).await?;
 
-        extended(&base, addition, features, others)
+        extended(&base, addition, others)
     }
 
     /// Extends the newest revision of a room, as [`Store::extended_room`], and publishes the
@@ -79,8 +79,7 @@ impl Store {
     /// As [`Store::extended_room`] and [`Store::publish_room`].
     pub async fn extend_room(
         &self,
-        addition: &Room,
-        features: &[Features],
+        addition: RoomContents<'_>,
         others: OtherFeatures,
     ) -> Result<Published, Error> {
         for _ in 0..ATTEMPTS {
@@ -90,7 +89,7 @@ impl Store {
                 keypoints,
                 base,
                 is_there,
-            } = self.extended_room(addition, features, others).await?;
+            } = self.extended_room(addition, others).await?;
 
             if is_there {
                 let folder = folder_of(Kind::Room, room.id().as_str());
@@ -117,7 +116,7 @@ impl Store {
         }
 
         Err(Error::Contended {
-            name: addition.id().to_string(),
+            name: addition.room.id().to_string(),
         })
     }
 }
@@ -125,17 +124,21 @@ impl Store {
 /// Appends the frames of `addition` to those of `base`.
 fn extended(
     base: &StoredRoom,
-    addition: &Room,
-    features: &[Features],
+    addition: RoomContents<'_>,
     others: OtherFeatures,
 ) -> Result<ExtendedRoom, Error> {
+    let RoomContents {
+        room: addition,
+        features: added_features,
+        keypoints: added_keypoints,
+    } = addition;
     let refused = |problem: Cause| Error::CannotAdd {
         room: base.room.id().to_string(),
         problem,
     };
 
     let features =
-        joined_features(base, features, others).map_err(|problem| refused(problem.into()))?;
+        joined_features(base, added_features, others).map_err(|problem| refused(problem.into()))?;
     if has_frames(base, addition, &features) {
         return Ok(ExtendedRoom {
             room: base.room.clone(),
@@ -170,7 +173,13 @@ fn extended(
 
     let room = Room::new(base.room.id().clone(), frames, provenance)
         .map_err(|error| refused(error.into()))?;
-    let keypoints = joined_keypoints(base, addition.frame_count(), &features);
+    let keypoints = joined_keypoints(base, addition.frame_count(), added_keypoints)
+        .map_err(|problem| refused(problem.into()))?;
+    let is_of_features = |keypoints: &RoomKeypoints| {
+        let name = &keypoints.source.feature.name;
+        features.iter().any(|set| set.source().name == *name)
+    };
+    let keypoints = keypoints.filter(is_of_features);
     Ok(ExtendedRoom {
         room,
         features,
@@ -180,24 +189,68 @@ fn extended(
     })
 }
 
-/// The room's keypoints, with none for the added frames; `None` if the features of the same encoder
-/// pass are left behind.
+/// The keypoints of the room's frames, followed by those of the `added_count` added frames. Frames
+/// without keypoints are among them if only the room or only the addition has keypoints; `None` if
+/// neither has.
 fn joined_keypoints(
     base: &StoredRoom,
-    added: usize,
-    features: &[Features],
-) -> Option<RoomKeypoints> {
-    let RoomKeypoints { source, map } = base.keypoints.clone()?;
-    features
-        .iter()
-        .find(|set| set.source().name == source.feature.name)?;
+    added_count: usize,
+    added: Option<&RoomKeypoints>,
+) -> Result<Option<RoomKeypoints>, String> {
+    let added = added
+        .map(|added| with_features_of(base, added))
+        .transpose()?;
+    let empty = |count: usize| vec![MappedKeypoints::default(); count];
 
-    let mut map = (*map).clone();
-    map.frames
-        .resize(map.frames.len() + added, MappedKeypoints::default());
-    Some(RoomKeypoints {
+    match (base.keypoints.clone(), added) {
+        (None, None) => Ok(None),
+        (Some(mut known), None) => {
+            let frames = &mut Arc::make_mut(&mut known.map).frames;
+            frames.extend(empty(added_count));
+            Ok(Some(known))
+        }
+        (None, Some(mut added)) => {
+            let frames = &mut Arc::make_mut(&mut added.map).frames;
+            frames.splice(0..0, empty(base.room.frame_count()));
+            Ok(Some(added))
+        }
+        (Some(mut known), Some(added)) => {
+            let without_file = |source: &KeypointSource| KeypointSource {
+                model_file: String::new(),
+                ..source.clone()
+            };
+            if without_file(&known.source) != without_file(&added.source) {
+                return Err(
+                    "their keypoints were detected by another encoder, or from other outputs, than those of the \
+                     room; encode them in the same way, or leave the keypoints out"
+                        .to_owned(),
+                );
+            }
+            let map = Arc::make_mut(&mut known.map);
+            map.append(&added.map).map_err(|error| error.to_string())?;
+            Ok(Some(known))
+        }
+    }
+}
+
+/// Added keypoints that belong to a feature set of the room.
+fn with_features_of(base: &StoredRoom, added: &RoomKeypoints) -> Result<RoomKeypoints, String> {
+    if base.room.provenance().camera != Some(added.map.camera) {
+        return Err(
+            "their keypoints were made with another camera than that of the room; encode them with the camera of \
+             the room, or leave the keypoints out"
+                .to_owned(),
+        );
+    }
+
+    let place = place_among(&base.features, &added.source.feature)?;
+    let source = KeypointSource {
+        feature: base.features[place].source().clone(),
+        ..added.source.clone()
+    };
+    Ok(RoomKeypoints {
         source,
-        map: Arc::new(map),
+        map: added.map.clone(),
     })
 }
 
@@ -209,7 +262,7 @@ fn joined_features(
 ) -> Result<Vec<Features>, String> {
     let mut rows_of: Vec<Option<&Features>> = vec![None; base.features.len()];
     for set in added {
-        let place = place_among(&base.features, set)?;
+        let place = place_among(&base.features, set.source())?;
         if rows_of[place].replace(set).is_some() {
             let name = &base.features[place].source().name;
             return Err(format!(
@@ -242,11 +295,11 @@ fn joined_features(
 
 /// Index of the room's feature set that matches an added one: among sets with the same source
 /// settings, the one of the same name, or the only one.
-fn place_among(known: &[Features], added: &Features) -> Result<usize, String> {
+fn place_among(known: &[Features], added: &FeatureSource) -> Result<usize, String> {
     let alike: Vec<usize> = (0..known.len())
-        .filter(|&place| known[place].source().is_like(added.source()))
+        .filter(|&place| known[place].source().is_like(added))
         .collect();
-    let name = &added.source().name;
+    let name = &added.name;
     let of_same_name = alike
         .iter()
         .find(|&&place| known[place].source().name == *name);

@@ -91,18 +91,32 @@ impl DescriptorBasis {
             }
         }
 
-        let projected = (full - &self.mean).dot(&self.axes);
-        let mut compressed = Vec::with_capacity(projected.len());
-        for row in projected.outer_iter() {
-            let length = row.dot(&row).sqrt().max(1e-9);
-            compressed.extend(
-                row.iter()
-                    .map(|value| (value / length * SCALE).round().clamp(-127.0, 127.0) as i8),
-            );
-        }
-
-        compressed
+        packed(&(full - &self.mean).dot(&self.axes))
     }
+
+    /// Descriptors that another basis compressed, compressed by this one. Neglects the difference of
+    /// the means: both bases are of one encoder.
+    ///
+    /// # Panics
+    /// If the bases have different widths.
+    pub fn compress_again(&self, compressed: &[i8], former: &Self) -> Vec<i8> {
+        let change = former.axes.t().dot(&self.axes);
+        packed(&unpacked(compressed).dot(&change))
+    }
+}
+
+/// The rows of a matrix, scaled to unit length, as compressed descriptors.
+fn packed(rows: &Array2<f32>) -> Vec<i8> {
+    let mut compressed = Vec::with_capacity(rows.len());
+    for row in rows.outer_iter() {
+        let length = row.dot(&row).sqrt().max(1e-9);
+        compressed.extend(
+            row.iter()
+                .map(|value| (value / length * SCALE).round().clamp(-127.0, 127.0) as i8),
+        );
+    }
+
+    compressed
 }
 
 /// Compressed descriptors as numbers, shape (n, [`COMPRESSED`]); cosines are their dot products.

@@ -100,6 +100,32 @@ pub struct KeypointMap {
     pub frames: Vec<MappedKeypoints>,
 }
 
+impl KeypointMap {
+    /// Appends the frames of another map of the same camera and encoder. Their descriptors are
+    /// compressed by the basis of this map; noise and unit stay those of this map.
+    ///
+    /// # Errors
+    /// [`Error::OtherDescriptors`] if the descriptors have another width.
+    pub fn append(&mut self, added: &Self) -> Result<(), Error> {
+        let [known, other] = [self, added].map(|map| map.basis.width());
+        if known != other {
+            return Err(Error::OtherDescriptors {
+                known,
+                added: other,
+            });
+        }
+
+        let mut appended = added.frames.clone();
+        if self.basis != added.basis {
+            for frame in &mut appended {
+                frame.descriptors = self.basis.compress_again(&frame.descriptors, &added.basis);
+            }
+        }
+        self.frames.extend(appended);
+        Ok(())
+    }
+}
+
 /// Triangulates the keypoints of a room's frames, frame by frame.
 pub struct Mapping<'a> {
     frames: Vec<PosedKeypoints<'a>>,

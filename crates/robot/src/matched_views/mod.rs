@@ -32,4 +32,8 @@ pub use retrieval::PlaceIndex;
 pub enum Error {
     #[error("no frame has a keypoint; check that the images are sharp and not blank")]
     NoDescriptors,
+    #[error(
+        "the descriptors have {added} numbers, those of the map {known}: another model made them"
+    )]
+    OtherDescriptors { known: usize, added: usize },
 }

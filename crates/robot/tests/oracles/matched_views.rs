@@ -20,6 +20,7 @@ const FRAMES: usize = 40;
 const POINTS: usize = 600;
 
 /// A scene with the keypoints of mapped cameras.
+#[derive(Clone)]
 struct World {
     scene: Scene,
     camera: CameraIntrinsics,
@@ -222,6 +223,43 @@ fn errors_under_pixel_noise_agree_with_the_covariance() {
         assert!((2.0..9.0).contains(&mean), "mean squared length {mean}");
         assert!(longest < 6.0, "{longest} standard deviations");
         assert!(worst < 0.03, "{worst} m");
+    }
+}
+
+/// Oracle: the true poses of views of the added frames. The first map has none of them, so that its
+/// basis is of other descriptors.
+#[test]
+fn views_of_appended_frames_are_located() {
+    let world = World::exact();
+    let half = FRAMES / 2;
+    let part = |rows: std::ops::Range<usize>| World {
+        scene: world.scene.clone(),
+        camera: world.camera,
+        poses: world.poses[rows.clone()].to_vec(),
+        views: world.views[rows].to_vec(),
+    };
+    let [known, added] = [part(0..half), part(half..FRAMES)];
+    let mut map = known.map(&known.poses, world.camera);
+    map.append(&added.map(&added.poses, world.camera)).unwrap();
+    let room = world.room_of(&world.poses, map);
+
+    let moved = Pose::new(
+        Vector3::new(0.03, -0.02, 0.01),
+        Vector3::new(0.02, 0.01, -0.03),
+    );
+    for row in (half + 5..FRAMES - 5).step_by(3) {
+        let pose = world.poses[row] * moved;
+        let view = world
+            .scene
+            .view(&pose, &world.camera, 0.0, &mut Random::new(8));
+        let view = ViewKeypoints {
+            keypoints: &view.keypoints,
+            camera: &world.camera,
+        };
+        let found = room.locate_near(view, &pose).unwrap();
+        assert!(found.matched.best_frame() >= half);
+        let error = PoseError::between(&pose, &found.pose.pose);
+        assert!(error.translation_m < 1e-3, "{error:?}");
     }
 }
 

@@ -135,10 +135,7 @@ impl Handlers {
         let store = changes.store.clone();
         if upload.validate_only {
             if upload.extend {
-                let check = async move {
-                    let UploadedRoom { room, features, .. } = &uploaded;
-                    store.extended_room(room, features, others).await
-                };
+                let check = async move { store.extended_room(uploaded.contents(), others).await };
                 on_blocking_thread(check).await??;
             }
             return Ok(pb::CreateRoomResponse::default());
@@ -149,8 +146,7 @@ impl Handlers {
             // Uploaded data counts toward the limit until it is stored.
             let _memory = memory;
             let published = if extend {
-                let UploadedRoom { room, features, .. } = &uploaded;
-                store.extend_room(room, features, others).await
+                store.extend_room(uploaded.contents(), others).await
             } else {
                 store.publish_contents(uploaded.contents()).await
             };
@@ -359,10 +355,6 @@ fn check_extension(upload: &pb::RoomUpload) -> Result<(), Error> {
         };
     }
 
-    if upload.keypoints.is_some() {
-        let problem = "must be left out: known frames keep theirs, and added frames have none";
-        return Err(Error::invalid("keypoints", problem));
-    }
     for (field, words) in [("format", &upload.format), ("licence", &upload.licence)] {
         if !words.is_empty() {
             let problem = "must be left out: a room that is extended keeps its own";

@@ -126,36 +126,48 @@ async fn uploaded_keypoints_are_stored_as_those_from_the_disk() {
     assert_eq!(stored(&store, "there").await.map.frames, here.map.frames);
 }
 
-/// Oracle: the definition of the keypoints of a frame: those of known frames stay, an added frame has
-/// none.
+/// Oracle: the definition of the keypoints of a frame: those of known frames stay; added frames have
+/// those that were sent with them, or none.
 #[tokio::test]
-async fn frames_that_extend_a_room_have_no_keypoints() {
+async fn frames_that_extend_a_room_have_the_keypoints_that_are_sent() {
     let (server, store) = start_writable().await;
     upload("rooms/a").send(&server.client).await.unwrap();
     let known = stored(&store, "a").await.map.frames.clone();
 
     let room = room_of("any", "synthetic_b");
-    let mut extension = Upload::of("rooms/a", &room, &features_of("synthetic_b"));
-    extension.batches.truncate(1);
-    extension.spec.extend = true;
-    let mut with_keypoints = extension.clone();
+    let mut without = Upload::of("rooms/a", &room, &features_of("synthetic_b"));
+    without.batches.truncate(1);
+    without.spec.extend = true;
+    let mut with = without.clone();
     let whole = upload("rooms/a");
-    with_keypoints.spec.keypoints = whole.spec.keypoints;
-    with_keypoints.keypoints = whole.keypoints;
-    let answer = with_keypoints.send(&server.client).await;
-    refused(
-        "keypoints of added frames",
-        answer,
-        Code::InvalidArgument,
-        "room.keypoints",
-    );
+    with.spec.camera = whole.spec.camera;
+    with.spec.keypoints = whole.spec.keypoints;
+    let sent = keypoints(100);
+    with.keypoints = parts(&sent.to_bytes().unwrap());
 
-    let answer = extension.send(&server.client).await.unwrap();
+    let mut of_another_camera = with.clone();
+    of_another_camera.spec.camera.as_mut().unwrap().fx *= 1.001;
+    let answer = of_another_camera.send(&server.client).await;
+    refused("camera", answer, Code::InvalidArgument, "another camera");
+
+    let answer = with.send(&server.client).await.unwrap();
     assert_eq!(answer.revision.unwrap().revision, 2);
     let joined = stored(&store, "a").await.map.frames.clone();
     assert_eq!(joined.len(), FRAMES + 100);
     assert_eq!(joined[..FRAMES], known);
-    assert!(joined[FRAMES..].iter().all(MappedKeypoints::is_empty));
+    let counts =
+        |frames: &[MappedKeypoints]| frames.iter().map(MappedKeypoints::len).collect::<Vec<_>>();
+    assert_eq!(counts(&joined[FRAMES..]), counts(&sent.map.frames));
+
+    without.batches[0]
+        .timestamps_ns
+        .iter_mut()
+        .for_each(|t| *t += 1_000_000_000_000);
+    let answer = without.send(&server.client).await.unwrap();
+    assert_eq!(answer.revision.unwrap().revision, 3);
+    let last = stored(&store, "a").await.map.frames.clone();
+    assert_eq!(last[..FRAMES + 100], joined);
+    assert!(last[FRAMES + 100..].iter().all(MappedKeypoints::is_empty));
 }
 
 /// The stated keypoints of an upload.

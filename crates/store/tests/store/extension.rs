@@ -2,7 +2,7 @@
 
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
-use seese3_store::{Error, OtherFeatures, Store};
+use seese3_store::{Error, OtherFeatures, RoomContents, Store};
 
 use crate::store::stored;
 use seese3_testing::recording::{room, set};
@@ -48,7 +48,12 @@ async fn added_frames_follow_the_rooms_own() {
     let (_folder, store) = begun().await;
     let features = [rows("g", 2.0, 260..300), rows("f", 1.0, 260..300)];
     let addition = part(260..300);
-    let extend = || store.extend_room(&addition, &features, OtherFeatures::Required);
+    let extend = || {
+        store.extend_room(
+            RoomContents::of(&addition, &features),
+            OtherFeatures::Required,
+        )
+    };
 
     let published = extend().await.unwrap();
     assert_eq!((published.revision, published.is_new), (2, true));
@@ -90,7 +95,9 @@ async fn added_frames_follow_the_rooms_own() {
     let features = [rows("f", 1.0, 100..140), rows("g", 2.0, 100..140)];
     let others = OtherFeatures::Required;
     let addition = part(100..140);
-    let old = store.extend_room(&addition, &features, others).await;
+    let old = store
+        .extend_room(RoomContents::of(&addition, &features), others)
+        .await;
     let old = old.unwrap();
     assert_eq!((old.revision, old.is_new), (2, false));
 
@@ -102,7 +109,10 @@ async fn added_frames_follow_the_rooms_own() {
         ..known
     };
     let again = Room::new(addition.id().clone(), frames, Provenance::default()).unwrap();
-    let extended = store.extend_room(&again, &features, others).await.unwrap();
+    let extended = store
+        .extend_room(RoomContents::of(&again, &features), others)
+        .await
+        .unwrap();
     assert_eq!((extended.revision, extended.is_new), (3, true));
     assert!(store.verify(&|_| ()).await.unwrap().is_empty());
 }
@@ -134,7 +144,10 @@ async fn frames_that_do_not_fit_are_refused() {
         (elsewhere, both(), "'b'"),
     ] {
         let refused = store
-            .extend_room(&addition, &features, OtherFeatures::Required)
+            .extend_room(
+                RoomContents::of(&addition, &features),
+                OtherFeatures::Required,
+            )
             .await
             .unwrap_err();
         assert!(refused.to_string().contains(word), "{refused}");
@@ -148,7 +161,10 @@ async fn frames_that_do_not_fit_are_refused() {
 
     // On purpose, a set may be left behind.
     let published = store
-        .extend_room(&part(260..300), &one(), OtherFeatures::LeftBehind)
+        .extend_room(
+            RoomContents::of(&part(260..300), &one()),
+            OtherFeatures::LeftBehind,
+        )
         .await
         .unwrap();
     let newest = store.load_room("a", None).await.unwrap();
@@ -176,7 +192,9 @@ async fn features_that_are_made_alike_are_told_by_their_names() {
         let store = store.clone();
         async move {
             let others = OtherFeatures::Required;
-            store.extend_room(&part(260..300), &features, others).await
+            store
+                .extend_room(RoomContents::of(&part(260..300), &features), others)
+                .await
         }
     };
     for (features, word) in [
@@ -218,7 +236,10 @@ async fn frames_that_are_added_at_the_same_time_are_all_there() {
         let features = [rows("f", 1.0, first..first + 10)];
         tokio::spawn(async move {
             store
-                .extend_room(&addition, &features, OtherFeatures::Required)
+                .extend_room(
+                    RoomContents::of(&addition, &features),
+                    OtherFeatures::Required,
+                )
                 .await
         })
     });

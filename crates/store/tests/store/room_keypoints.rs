@@ -3,9 +3,12 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use ndarray::{Array1, Array2};
+
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::keypoints::KeypointSource;
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
+use seese3_robot::matched_views::{COMPRESSED, DescriptorBasis, KeypointMap, MappedKeypoints};
 use seese3_store::{Error, OtherFeatures, RoomContents, RoomKeypoints, Store};
 
 use crate::store::{files, stored};
@@ -241,7 +244,7 @@ async fn added_frames_have_no_keypoints() {
             vec![features("g", 260..300)]
         };
         store
-            .extend_room(&part(260..300), &added, others)
+            .extend_room(RoomContents::of(&part(260..300), &added), others)
             .await
             .unwrap();
         let back = store.load_room("a", None).await.unwrap();
@@ -254,6 +257,102 @@ async fn added_frames_have_no_keypoints() {
             assert!(back.keypoints.is_none());
         }
         assert!(store.verify(&|_| ()).await.unwrap().is_empty());
+    }
+}
+
+/// A store whose room has the first 260 frames of `room("a")`, with these keypoints.
+async fn begun_with_260(known: Option<&RoomKeypoints>) -> (tempfile::TempDir, Store) {
+    let (folder, store) = stored().await;
+    let rows: Vec<usize> = (0..260).collect();
+    let frames = room("a").frames().select(&rows);
+    let provenance = room("a").provenance().clone();
+    let begun = Room::new(RoomId::new("a").unwrap(), frames, provenance).unwrap();
+    let features = [features("f", 0..260)];
+    let contents = RoomContents {
+        keypoints: known,
+        ..RoomContents::of(&begun, &features)
+    };
+    store.publish_contents(contents).await.unwrap();
+    (folder, store)
+}
+
+/// Oracle: the definition: the frames of both, each with its own keypoints. Both maps have the same
+/// basis, so that no descriptor changes.
+#[tokio::test]
+async fn added_frames_bring_their_keypoints() {
+    let [known, added] = [keypoints(260, 5), keypoints(40, 7)];
+    for begins_with_keypoints in [true, false] {
+        let known = begins_with_keypoints.then_some(&known);
+        let (_folder, store) = begun_with_260(known).await;
+        let (frames, features) = (part(260..300), [features("f", 260..300)]);
+        let contents = RoomContents {
+            keypoints: Some(&added),
+            ..RoomContents::of(&frames, &features)
+        };
+        let others = OtherFeatures::Required;
+        store.extend_room(contents, others).await.unwrap();
+
+        let joined = store.load_room("a", None).await.unwrap().keypoints.unwrap();
+        let counts = |map: &KeypointMap| {
+            map.frames
+                .iter()
+                .map(MappedKeypoints::len)
+                .collect::<Vec<_>>()
+        };
+        let found = counts(&joined.map);
+        assert_eq!(
+            found[..260],
+            known.map_or(vec![0; 260], |known| counts(&known.map))
+        );
+        assert_eq!(found[260..], counts(&added.map));
+        for (found, sent) in joined.map.frames[260..].iter().zip(&added.map.frames) {
+            assert_eq!(found.descriptors, sent.descriptors);
+        }
+        assert!(store.verify(&|_| ()).await.unwrap().is_empty());
+    }
+}
+
+/// Oracle: the promise that nothing is lost: keypoints that do not belong to the room are refused with
+/// what to change, and nothing is published.
+#[tokio::test]
+async fn added_keypoints_of_another_kind_are_refused() {
+    let known = keypoints(260, 5);
+    let (_folder, store) = begun_with_260(Some(&known)).await;
+    let (frames, features) = (part(260..300), [features("f", 260..300)]);
+    let cases: [(fn(&mut RoomKeypoints), &str); 4] = [
+        (|k| k.source.descriptors = "other".into(), "another encoder"),
+        (
+            |k| Arc::make_mut(&mut k.map).camera = distorted_camera(),
+            "another camera",
+        ),
+        (
+            |k| {
+                let axes = Array2::zeros((8, COMPRESSED));
+                let basis = DescriptorBasis::from_parts(Array1::zeros(8), axes);
+                Arc::make_mut(&mut k.map).basis = basis.unwrap();
+            },
+            "another model",
+        ),
+        (
+            |k| k.source.feature.layer = "other".into(),
+            "computed differently",
+        ),
+    ];
+    for (change, expected) in cases {
+        let mut added = keypoints(40, 7);
+        change(&mut added);
+        let contents = RoomContents {
+            keypoints: Some(&added),
+            ..RoomContents::of(&frames, &features)
+        };
+        let others = OtherFeatures::Required;
+        let refused = store.extend_room(contents, others).await.unwrap_err();
+        assert!(matches!(refused, Error::CannotAdd { .. }), "{refused}");
+        assert!(refused.to_string().contains(expected), "{refused}");
+        assert_eq!(
+            store.load_room("a", None).await.unwrap().room.frame_count(),
+            260
+        );
     }
 }
 
