@@ -17,7 +17,7 @@ use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::{CameraIntrinsics, Pose};
 use seese3_core::room::{Room, is_plain_name};
 use seese3_encoder::{Encoded, Encoder, Journal, Kept, OnBadImage, Task, encode_room, read_image};
-use seese3_robot::matched_views::{KeypointMap, MappedKeypoints, TrialRecording};
+use seese3_robot::matched_views::{KeypointMap, MappedKeypoints};
 use seese3_store::{Published, RoomContents, RoomKeypoints, Store, StoredRoom};
 
 /// Maximum number of unreadable images that are listed one by one; further ones are only counted.
@@ -214,13 +214,7 @@ impl Encode {
     ) -> anyhow::Result<KeypointMap> {
         let poses = room.frames().select(&encoded.good).poses;
         let pool = self.runtime.pool()?;
-        pool.install(|| {
-            map_keypoints(TrialRecording {
-                poses: &poses,
-                keypoints: &encoded.keypoints,
-                camera,
-            })
-        })
+        pool.install(|| map_keypoints(&poses, &encoded.keypoints, camera))
     }
 
     fn journal_path(&self, key: &str) -> anyhow::Result<PathBuf> {

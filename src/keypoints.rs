@@ -7,11 +7,11 @@ use anyhow::{Context, bail};
 
 use super::progress::bar;
 use seese3_core::features::FeatureSource;
-use seese3_core::geometry::CameraIntrinsics;
+use seese3_core::geometry::{CameraIntrinsics, Pose};
 use seese3_core::image::RgbImage;
-use seese3_core::keypoints::KeypointSource;
+use seese3_core::keypoints::{KeypointSource, Keypoints};
 use seese3_encoder::{Encoder, KeypointOutputs};
-use seese3_robot::matched_views::{KeypointMap, Mapping, MappingParameters, TrialRecording};
+use seese3_robot::matched_views::{KeypointMap, Mapping, MappingParameters};
 use seese3_store::RoomKeypoints;
 
 /// Largest relative difference between the aspect ratios of an image and of its camera.
@@ -19,19 +19,17 @@ const MAX_ASPECT_DIFFERENCE: f64 = 0.01;
 
 /// Triangulates the keypoints of mapped frames and measures the noise of the map, on the threads of
 /// the calling rayon pool.
-pub fn map_keypoints(recording: TrialRecording<'_>) -> anyhow::Result<KeypointMap> {
-    let TrialRecording {
-        poses,
-        keypoints,
-        camera,
-        ..
-    } = recording;
+pub fn map_keypoints(
+    poses: &[Pose],
+    keypoints: &[Keypoints],
+    camera: CameraIntrinsics,
+) -> anyhow::Result<KeypointMap> {
     let mapping = Mapping::new(poses, keypoints, camera, MappingParameters::default())?;
     let progress = bar(mapping.frame_count() as u64, "triangulating keypoints");
     let mut map = mapping.map(&|| progress.inc(1));
 
     progress.set_message("measuring the noise of the map");
-    map.measure_noise(recording);
+    map.measure_noise(&mapping);
     progress.finish_and_clear();
     Ok(map)
 }

@@ -183,7 +183,7 @@ fn keypoints_upload(
         design_effect: noise.design_effect,
         gap_scale: noise.gap_scale,
         pose_noise: noise.pose_noise,
-        pose_drift: noise.pose_drift,
+        relative_error: noise.relative_error,
     })
 }
 

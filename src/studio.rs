@@ -23,7 +23,6 @@ use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_encoder::{
     Encoded, Encoder, Error, OnBadImage, Task, encode_png, encode_room, read_image,
 };
-use seese3_robot::matched_views::TrialRecording;
 use seese3_store::{RoomContents, RoomKeypoints, Store, StoredRoom};
 use seese3_studio::{Film, Suite, Variation};
 
@@ -350,11 +349,7 @@ impl Studio {
         let Some((outputs, camera)) = mapping_inputs(encoder, camera, room.id().as_str())? else {
             return Ok(None);
         };
-        let map = map_keypoints(TrialRecording {
-            poses: room.poses(),
-            keypoints: &encoded.keypoints,
-            camera,
-        })?;
+        let map = map_keypoints(room.poses(), &encoded.keypoints, camera)?;
         room_keypoints(map, feature.clone(), outputs, &self.encode).map(Some)
     }
 

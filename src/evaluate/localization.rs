@@ -15,12 +15,11 @@ use seese3_core::training::RoomData;
 use seese3_lab::experiments::check_hold_out;
 use seese3_lab::experiments::localization::{LocalizationProtocol, RuleScores, evaluate};
 use seese3_lab::experiments::matched_localization::{
-    self, MappedAndAsked, MatchedLocalization, PeerAnswer,
+    self, MappedAndAsked, MatchedLocalization, PeerAnswer, PosedRecording,
 };
 use seese3_lab::report::{
     LocalizationContext, LocalizationJson, localization_table, matched_localization_table,
 };
-use seese3_robot::matched_views::TrialRecording;
 
 use super::super::fit::fitting_bar;
 use super::super::named::one_of;
@@ -149,7 +148,7 @@ impl Localization {
 
         let (mapped, asked) = self.frames(&stored)?;
         let encoded = self.views.encode(&stored, keypoints)?;
-        let recording = TrialRecording {
+        let recording = PosedRecording {
             poses: stored.room.poses(),
             keypoints: &encoded.keypoints,
             camera: keypoints.map.camera,

@@ -28,11 +28,12 @@ const WAITING: usize = 32;
 pub struct Track {
     #[command(flatten)]
     server: Server,
-    /// Name of the room; if omitted, the server finds it among all rooms that the adapter fits
+    /// Name of the room; if omitted, the server finds it among all rooms that the adapter fits or, for
+    /// images if no adapter can track, among all rooms with keypoints
     #[arg(long)]
     room: Option<String>,
     /// Name of the adapter; if omitted, the newest that can track in the room, or without a room
-    /// the only one that can track
+    /// the only one that can track. If none can, images are tracked by their keypoints
     #[arg(long)]
     adapter: Option<String>,
     /// A NumPy file of features, shape (n, d), one row per frame

@@ -86,7 +86,7 @@ def room_with_keypoints(store: seese3.Store, tensors: dict[str, np.ndarray]) -> 
         "camera": body["provenance"]["camera"],
         "unit_m": 2.0,
         "epipolar_px": 0.5,
-        "noise": {"design_effect": 2.0, "gap_scale": 0.1, "pose_noise": 0.01, "pose_drift": 0.01},
+        "noise": {"design_effect": 2.0, "gap_scale": 0.1, "pose_noise": 0.01, "relative_error": 0.01},
         "object": {"file": file, "sha256": sha256, "bytes": len(content)},
     }
     sealed(manifest, body)

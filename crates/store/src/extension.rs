@@ -1,5 +1,6 @@
 //! Adds frames to a stored room, for instance a robot's own frames of unmapped places.
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use ndarray::{Axis, concatenate, s};
@@ -139,13 +140,25 @@ fn extended(
 
     let features =
         joined_features(base, added_features, others).map_err(|problem| refused(problem.into()))?;
-    if has_frames(base, addition, &features) {
+    if let Some(rows) = known_rows(base, addition, &features) {
+        let has_keypoints = |keypoints: &RoomKeypoints| {
+            let mut frames = keypoints.map.frames[rows.clone()].iter();
+            frames.any(|frame| !frame.is_empty())
+        };
+        let is_there =
+            added_keypoints.is_none() || base.keypoints.as_ref().is_some_and(has_keypoints);
+        let keypoints = if is_there {
+            base.keypoints.clone()
+        } else {
+            joined_keypoints(base, rows, added_keypoints)
+                .map_err(|problem| refused(problem.into()))?
+        };
         return Ok(ExtendedRoom {
             room: base.room.clone(),
             features: base.features.clone(),
-            keypoints: base.keypoints.clone(),
+            keypoints,
             base: base.revision,
-            is_there: true,
+            is_there,
         });
     }
     let frames = joined_frames(base.room.frames(), addition.frames())
@@ -173,8 +186,10 @@ fn extended(
 
     let room = Room::new(base.room.id().clone(), frames, provenance)
         .map_err(|error| refused(error.into()))?;
-    let keypoints = joined_keypoints(base, addition.frame_count(), added_keypoints)
-        .map_err(|problem| refused(problem.into()))?;
+    let known = base.room.frame_count();
+    let rows = known..known + addition.frame_count();
+    let keypoints =
+        joined_keypoints(base, rows, added_keypoints).map_err(|problem| refused(problem.into()))?;
     let is_of_features = |keypoints: &RoomKeypoints| {
         let name = &keypoints.source.feature.name;
         features.iter().any(|set| set.source().name == *name)
@@ -189,30 +204,25 @@ fn extended(
     })
 }
 
-/// The keypoints of the room's frames, followed by those of the `added_count` added frames. Frames
-/// without keypoints are among them if only the room or only the addition has keypoints; `None` if
-/// neither has.
+/// The keypoints of the room with those of the added frames, which are in `rows` of the joined room.
+/// Frames without keypoints are among them if only the room or only the addition has keypoints; `None`
+/// if neither has.
 fn joined_keypoints(
     base: &StoredRoom,
-    added_count: usize,
+    rows: Range<usize>,
     added: Option<&RoomKeypoints>,
 ) -> Result<Option<RoomKeypoints>, String> {
+    let frame_count = base.room.frame_count().max(rows.end);
     let added = added
         .map(|added| with_features_of(base, added))
         .transpose()?;
-    let empty = |count: usize| vec![MappedKeypoints::default(); count];
 
-    match (base.keypoints.clone(), added) {
-        (None, None) => Ok(None),
-        (Some(mut known), None) => {
-            let frames = &mut Arc::make_mut(&mut known.map).frames;
-            frames.extend(empty(added_count));
-            Ok(Some(known))
-        }
+    let (mut joined, added_frames) = match (base.keypoints.clone(), added) {
+        (None, None) => return Ok(None),
+        (Some(known), None) => (known, Vec::new()),
         (None, Some(mut added)) => {
-            let frames = &mut Arc::make_mut(&mut added.map).frames;
-            frames.splice(0..0, empty(base.room.frame_count()));
-            Ok(Some(added))
+            let frames = std::mem::take(&mut Arc::make_mut(&mut added.map).frames);
+            (added, frames)
         }
         (Some(mut known), Some(added)) => {
             let without_file = |source: &KeypointSource| KeypointSource {
@@ -227,20 +237,35 @@ fn joined_keypoints(
                 );
             }
             let map = Arc::make_mut(&mut known.map);
+            let count = map.frames.len();
             map.append(&added.map).map_err(|error| error.to_string())?;
-            Ok(Some(known))
+            let frames = map.frames.split_off(count);
+            (known, frames)
         }
+    };
+
+    let frames = &mut Arc::make_mut(&mut joined.map).frames;
+    frames.resize(frame_count, MappedKeypoints::default());
+    for (row, frame) in rows.zip(added_frames) {
+        frames[row] = frame;
     }
+    Ok(Some(joined))
 }
 
 /// Added keypoints that belong to a feature set of the room.
 fn with_features_of(base: &StoredRoom, added: &RoomKeypoints) -> Result<RoomKeypoints, String> {
-    if base.room.provenance().camera != Some(added.map.camera) {
-        return Err(
+    let problem = match base.room.provenance().camera {
+        None => {
+            "their keypoints need a camera, which the room does not have; leave the keypoints out"
+        }
+        Some(camera) if camera != added.map.camera => {
             "their keypoints were made with another camera than that of the room; encode them with the camera of \
              the room, or leave the keypoints out"
-                .to_owned(),
-        );
+        }
+        Some(_) => "",
+    };
+    if !problem.is_empty() {
+        return Err(problem.to_owned());
     }
 
     let place = place_among(&base.features, &added.source.feature)?;
@@ -327,13 +352,13 @@ fn place_among(known: &[Features], added: &FeatureSource) -> Result<usize, Strin
     }
 }
 
-/// Whether the base already has the added frames as a contiguous run, with the same poses, times
-/// and features. `joined` has the rows of both.
-fn has_frames(base: &StoredRoom, addition: &Room, joined: &[Features]) -> bool {
+/// Where the base already has the added frames as a contiguous run, with the same poses, times and
+/// features. `joined` has the rows of both.
+fn known_rows(base: &StoredRoom, addition: &Room, joined: &[Features]) -> Option<Range<usize>> {
     let known = base.room.frame_count();
     let added = addition.frame_count();
     if joined.len() != base.features.len() || added > known {
-        return false;
+        return None;
     }
 
     // Reading projects stored rotations, so equal ones agree only up to rounding.
@@ -353,7 +378,8 @@ fn has_frames(base: &StoredRoom, addition: &Room, joined: &[Features]) -> bool {
         pairs.all(|(a, b)| same(a, b)) && joined.iter().all(same_rows)
     };
 
-    (0..=known - added).any(begins_at)
+    let first = (0..=known - added).find(|&first| begins_at(first))?;
+    Some(first..first + added)
 }
 
 /// Every column of the known frames, with that of the added frames appended.

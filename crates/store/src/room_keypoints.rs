@@ -71,7 +71,7 @@ impl KeypointsHeader {
             design_effect,
             gap_scale,
             pose_noise,
-            pose_drift,
+            relative_error,
         } = self.noise;
 
         let numbers = [
@@ -80,7 +80,7 @@ impl KeypointsHeader {
             ("design_effect", design_effect),
             ("gap_scale", gap_scale),
             ("pose_noise", pose_noise),
-            ("pose_drift", pose_drift),
+            ("relative_error", relative_error),
         ];
         let is_wrong = |(_, value): &(_, f64)| !(LARGEST.recip()..=LARGEST).contains(value);
         match numbers.into_iter().find(is_wrong) {
@@ -370,7 +370,7 @@ mod tests {
             },
             "unit_m": 2.0, "epipolar_px": 0.5,
             "noise": {
-                "design_effect": 2.0, "gap_scale": 0.1, "pose_noise": 0.1, "pose_drift": 0.1,
+                "design_effect": 2.0, "gap_scale": 0.1, "pose_noise": 0.1, "relative_error": 0.1,
             },
         }))
         .unwrap()
@@ -462,7 +462,7 @@ mod tests {
                 (|header, bad| header.unit_m = bad) as fn(&mut KeypointsHeader, f64),
                 |header, bad| header.epipolar_px = bad,
                 |header, bad| header.noise.pose_noise = bad,
-                |header, bad| header.noise.pose_drift = bad,
+                |header, bad| header.noise.relative_error = bad,
                 |header, bad| header.noise.design_effect = bad,
                 |header, bad| header.noise.gap_scale = bad,
             ] {

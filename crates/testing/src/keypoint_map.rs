@@ -42,7 +42,7 @@ pub fn keypoint_map(camera: CameraIntrinsics, frame_count: usize, count: usize) 
             design_effect: 12.0,
             gap_scale: 0.3,
             pose_noise: 0.001,
-            pose_drift: 0.003,
+            relative_error: 0.003,
         },
         basis: DescriptorBasis::from_parts(mean, axes).unwrap(),
         frames,

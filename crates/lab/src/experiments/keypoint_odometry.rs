@@ -13,13 +13,13 @@ use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::HoldOut;
 use seese3_core::trajectory::Trajectory;
 use seese3_robot::localization::{FocalSearch, KeypointRoom, LocatedView, NotLocated};
-use seese3_robot::matched_views::{TrialRecording, ViewKeypoints};
+use seese3_robot::matched_views::ViewKeypoints;
 use seese3_robot::pose_filter::{FilterParameters, FilterRoom, PoseFilter, ViewObservation};
 use seese3_robot::tracking::{
     InitialPose, MatchedPose, PoseWithCovariance, Replay, Status, joined, period_ns,
 };
 
-use super::matched_localization::{Baselines, mapped_room};
+use super::matched_localization::{Baselines, PosedRecording, mapped_room};
 use super::odometry::{
     LostFrames, OTHER_ROOM_FRAMES, PERIOD_NS, RoomOdometry, RoomReplays, room_odometry,
 };
@@ -93,7 +93,7 @@ impl<'a> TrackedRoom<'a> {
         let room = recording.room;
         check_hold_out(room, hold_out)?;
         let mapped = hold_out.mapped(room.timeline());
-        let trials = TrialRecording {
+        let trials = PosedRecording {
             poses: room.poses(),
             keypoints: recording.keypoints,
             camera: recording.camera,
@@ -207,9 +207,13 @@ impl<'a> TrackedRoom<'a> {
                     camera: &camera,
                 };
                 let located = self.map.locate_from(matched, predicted.as_ref());
-                match view.camera {
-                    Some(_) => located,
-                    None => located.map(|located| search.with_focal_of(&camera, located)),
+                match (view.camera, located) {
+                    (None, Ok(located)) => Ok(search.with_focal_of(&camera, located)),
+                    (None, Err(why)) if why.is_of_camera() => {
+                        search.contradict();
+                        Err(why)
+                    }
+                    (_, located) => located,
                 }
             });
             let observation = self.observation(view, located);

@@ -8,14 +8,14 @@ use ndarray::{Array2, ArrayView1, ArrayView2};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use seese3_core::geometry::{Pose, PoseError, log};
+use seese3_core::geometry::{CameraIntrinsics, Pose, PoseError, log};
 use seese3_core::keypoints::Keypoints;
 use seese3_core::room::FrameId;
 use seese3_core::statistics::{
     Coverage, RecordedMedian, coverage, median_of_recording, root_mean_square,
 };
 use seese3_robot::localization::{KeypointRoom, NotLocated};
-use seese3_robot::matched_views::{Mapping, MappingParameters, TrialRecording, ViewKeypoints};
+use seese3_robot::matched_views::{Mapping, MappingParameters, ViewKeypoints};
 
 use super::Error;
 use super::localization::LocalizationErrors;
@@ -28,6 +28,17 @@ const WRONG_M: f64 = 0.2;
 const WRONG_RAD: f64 = 0.174_5;
 /// Number of blended frames.
 const BLENDED: usize = 3;
+
+/// The views of a recording. All slices have one entry per frame.
+#[derive(Debug, Clone, Copy)]
+pub struct PosedRecording<'a> {
+    /// `world_from_camera`.
+    pub poses: &'a [Pose],
+    /// Keypoints.
+    pub keypoints: &'a [Keypoints],
+    /// The camera.
+    pub camera: CameraIntrinsics,
+}
 
 /// The localization of the views of one part of a hold-out.
 #[derive(Debug, Clone, Serialize)]
@@ -154,7 +165,7 @@ struct Located {
 /// [`Error::Input`] if no frame is mapped or asked for, if no mapped frame has a keypoint, or if a
 /// peer answers a frame that is not asked for.
 pub fn evaluate(
-    recording: TrialRecording<'_>,
+    recording: PosedRecording<'_>,
     features: ArrayView2<'_, f32>,
     frames: MappedAndAsked<'_>,
     clock: &(dyn Fn() -> f64 + Sync),
@@ -211,7 +222,7 @@ pub fn evaluate(
 
 /// The room of the mapped frames alone, as `seese3 encode` would map it.
 pub(super) fn mapped_room(
-    recording: TrialRecording<'_>,
+    recording: PosedRecording<'_>,
     mapped: &[FrameId],
 ) -> Result<KeypointRoom, Error> {
     let rows: Vec<usize> = mapped.iter().map(|frame| frame.row()).collect();
@@ -220,11 +231,6 @@ pub(super) fn mapped_room(
         .iter()
         .map(|&row| recording.keypoints[row].clone())
         .collect();
-    let known = TrialRecording {
-        poses: &poses,
-        keypoints: &keypoints,
-        camera: recording.camera,
-    };
 
     let mapping = Mapping::new(
         &poses,
@@ -234,12 +240,12 @@ pub(super) fn mapped_room(
     );
     let mapping = mapping.map_err(|error| Error::Input(error.to_string()))?;
     let mut map = mapping.map(&|| ());
-    map.measure_noise(known);
-    Ok(KeypointRoom::new(poses.clone(), map.into()))
+    map.measure_noise(&mapping);
+    Ok(KeypointRoom::new(poses, map.into()))
 }
 
 fn located(
-    recording: TrialRecording<'_>,
+    recording: PosedRecording<'_>,
     room: &KeypointRoom,
     baselines: &Baselines<'_>,
     frame: FrameId,

@@ -8,9 +8,8 @@ use seese3_core::room::FrameId;
 use seese3_lab::experiments::Error;
 use seese3_lab::experiments::localization::LocalizationErrors;
 use seese3_lab::experiments::matched_localization::{
-    MappedAndAsked, MatchedLocalization, PeerAnswer, evaluate,
+    MappedAndAsked, MatchedLocalization, PeerAnswer, PosedRecording, evaluate,
 };
-use seese3_robot::matched_views::TrialRecording;
 use seese3_testing::keypoint_scene::{Random, Scene, camera_path, distorted_camera};
 use seese3_testing::near;
 
@@ -58,7 +57,7 @@ fn evaluated_beside(
     let features = Array2::from_shape_fn((poses.len(), 3), |(row, axis)| {
         1.0 + poses[row].translation.vector[axis] as f32
     });
-    let recording = TrialRecording {
+    let recording = PosedRecording {
         poses: &poses,
         keypoints: &keypoints,
         camera: distorted_camera(),

@@ -19,6 +19,10 @@ const MIN_FOCALS: usize = 3;
 /// Maximum number of focal lengths whose median is used.
 const MAX_FOCALS: usize = 30;
 
+/// Number of successive views whose matches contradict the estimated focal length before it is
+/// estimated again.
+const MAX_CONTRADICTIONS: u32 = 3;
+
 /// Relative standard deviation of an estimated focal length. Single views agree to 0.1 %, but the
 /// median was 0.5 % too long in the kitchen and in two drawn rooms.
 const FOCAL_DEVIATION: f64 = 0.005;
@@ -30,6 +34,8 @@ pub struct FocalSearch {
     focals: Vec<f64>,
     /// Number of views that were tried.
     views: u32,
+    /// Number of the last views that contradict the estimated focal length.
+    contradictions: u32,
 }
 
 impl FocalSearch {
@@ -41,7 +47,7 @@ impl FocalSearch {
         height: f64,
         rooms: impl Iterator<Item = &'a KeypointRoom>,
     ) -> Option<CameraIntrinsics> {
-        if self.focals.len() < MIN_FOCALS {
+        if self.focals.len() < MIN_FOCALS && !keypoints.is_empty() {
             self.views = self.views.saturating_add(1);
             if self.views > FIRST_TRIES && !self.views.is_multiple_of(FIRST_TRIES) {
                 return None;
@@ -63,6 +69,7 @@ impl FocalSearch {
         camera: &CameraIntrinsics,
         mut located: LocatedView,
     ) -> LocatedView {
+        self.contradictions = 0;
         if let Some(fit) = located.matched.focal
             && self.focals.len() < MAX_FOCALS
         {
@@ -73,6 +80,15 @@ impl FocalSearch {
         let along_axis_m = FOCAL_DEVIATION * located.matched.information.unit_m;
         located.pose.covariance[(2, 2)] += along_axis_m * along_axis_m;
         located
+    }
+
+    /// Notes a view whose matches contradict the estimated focal length. After several in succession
+    /// the search begins again.
+    pub fn contradict(&mut self) {
+        self.contradictions += 1;
+        if self.contradictions >= MAX_CONTRADICTIONS {
+            *self = Self::default();
+        }
     }
 }
 

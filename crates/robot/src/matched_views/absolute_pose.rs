@@ -48,13 +48,13 @@ pub(super) struct Correspondence {
 /// Noise of a map, from which the covariance of a view's pose follows:
 ///
 /// covariance = H⁻¹ · `design_effect` · (1 + gap / `gap_scale`)
-///            + (`pose_noise`² + `pose_drift`² · gap) · I
+///            + (`pose_noise`² + (`relative_error` · gap)²) · I
 ///
 /// H is the information matrix of the matches for independent errors, at the measured variance of
 /// their reprojection errors. The errors are correlated: nearby points share depth errors, whose
-/// effect on the pose grows with the gap. Stated poses have independent noise, and a random-walk
-/// drift with a variance proportional to the gap. I is the identity in units (median depths) and
-/// radians.
+/// effect on the pose grows with the gap. Stated poses have independent noise. Errors of the camera's
+/// focal length and lens, and of the scale of depths, move the pose by a share of the gap. I is the
+/// identity in units (median depths) and radians.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct MapNoise {
@@ -65,8 +65,8 @@ pub struct MapNoise {
     /// Standard deviation of the independent errors of stated poses: units (median depths) along
     /// each axis, and radians about it.
     pub pose_noise: f64,
-    /// Standard deviation of the drift of stated poses over a gap of 1, likewise.
-    pub pose_drift: f64,
+    /// Standard deviation of errors that are proportional to the gap, a share of the gap.
+    pub relative_error: f64,
 }
 
 impl MapNoise {
@@ -75,8 +75,20 @@ impl MapNoise {
         design_effect: 5.0,
         gap_scale: 0.05,
         pose_noise: 0.001,
-        pose_drift: 0.005,
+        relative_error: 0.01,
     };
+
+    /// The noise with all covariances multiplied by a factor.
+    #[must_use]
+    pub fn scaled(&self, factor: f64) -> Self {
+        let deviation = factor.sqrt();
+        Self {
+            design_effect: self.design_effect * factor,
+            gap_scale: self.gap_scale,
+            pose_noise: self.pose_noise * deviation,
+            relative_error: self.relative_error * deviation,
+        }
+    }
 }
 
 /// Settings of the search. Pixels are those of an image that is [`PIXEL_IMAGE_WIDTH`] pixels wide.
@@ -275,8 +287,8 @@ impl Search {
 
         // The information uses the measured variance of keypoint positions instead of the assumed
         // one.
-        let assumed = self.normal_equations(matches, &inliers, &pose).information;
         let inliers = self.inliers(matches, &pose.inverse());
+        let assumed = self.normal_equations(matches, &inliers, &pose).information;
         let variance_px = self.variance_px(matches, &inliers, &pose);
         let information = assumed * (self.deviation_px.powi(2) / variance_px);
         Some(Found {
@@ -409,7 +421,7 @@ impl PoseInformation {
     /// determine the pose.
     pub fn covariance(&self, noise: &MapNoise) -> Option<Matrix6<f64>> {
         let of_matches = self.factor(noise);
-        let rotation = noise.pose_noise.powi(2) + noise.pose_drift.powi(2) * self.gap;
+        let rotation = noise.pose_noise.powi(2) + (noise.relative_error * self.gap).powi(2);
         let position = rotation * self.unit_m.powi(2);
         let of_poses = Matrix6::from_diagonal(&Vector6::new(
             position, position, position, rotation, rotation, rotation,

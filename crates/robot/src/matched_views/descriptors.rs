@@ -137,7 +137,7 @@ pub(super) fn mutual_matches(
     let similarity = a.dot(&b.t());
     let mut best_in_b = vec![(0, f32::NEG_INFINITY); a.nrows()];
     let mut best_in_a = vec![(0, f32::NEG_INFINITY); b.nrows()];
-    for (row, similar) in similar_rows(&similarity) {
+    for (row, similar) in similarity.outer_iter().enumerate() {
         let best = &mut best_in_b[row];
         for (column, &value) in similar.iter().enumerate() {
             if value > best.1 {
@@ -155,14 +155,4 @@ pub(super) fn mutual_matches(
         .filter(|&(row, &(column, cosine))| cosine >= min_cosine && best_in_a[column].0 == row)
         .map(|(row, &(column, _))| (row, column))
         .collect()
-}
-
-/// The rows of a similarity matrix as slices, each with its number.
-fn similar_rows(similarity: &Array2<f32>) -> impl Iterator<Item = (usize, &[f32])> {
-    let width = similarity.ncols().max(1);
-    similarity
-        .as_slice()
-        .unwrap_or_default()
-        .chunks(width)
-        .enumerate()
 }

@@ -10,7 +10,7 @@ use nalgebra::{Cholesky, SMatrix, SVector, Vector6};
 use super::absolute_pose::{Correspondence, Search};
 use seese3_core::geometry::{Pose, Twist, exp};
 
-/// Thresholds step by step, in thresholds of an inlier.
+/// Threshold of each step, as a multiple of the inlier threshold.
 const THRESHOLDS: [f64; 10] = [4.0, 4.0, 3.0, 3.0, 2.0, 2.0, 1.5, 1.0, 1.0, 1.0];
 /// Largest change of the logarithm of the focal length in one step.
 const MAX_STEP: f64 = 0.1;
@@ -45,7 +45,8 @@ pub(super) fn fitted_focal(
 
     for ratio in THRESHOLDS {
         let threshold_px = ratio * search.threshold_px;
-        let normal = normal_equations(search, &zoomed(matches, log_factor), &pose, threshold_px);
+        let (search, matches) = zoomed(search, matches, log_factor);
+        let normal = normal_equations(&search, &matches, &pose, threshold_px);
         let cholesky = Cholesky::new(normal.information)?;
 
         // Long steps leave the range in which the projection is nearly linear.
@@ -68,7 +69,8 @@ pub(super) fn fitted_focal(
 
     let camera_from_world = pose.inverse();
     let squared_threshold = search.threshold_px * search.threshold_px;
-    let agreeing: Vec<usize> = zoomed(matches, log_factor)
+    let (search, matches) = zoomed(search, matches, log_factor);
+    let agreeing: Vec<usize> = matches
         .iter()
         .filter(|match_| search.squared_error(match_, &camera_from_world) < squared_threshold)
         .map(|match_| match_.keypoint)
@@ -82,16 +84,23 @@ pub(super) fn fitted_focal(
     })
 }
 
-/// The matches as seen by a camera whose focal length is longer by this logarithm.
-fn zoomed(matches: &[Correspondence], log_factor: f64) -> Vec<Correspondence> {
-    let scale = (-log_factor).exp();
-    matches
-        .iter()
-        .map(|match_| Correspondence {
-            plane: match_.plane * scale,
-            ..*match_
-        })
-        .collect()
+/// The search and the matches of a camera whose focal length is longer by this logarithm. Residuals
+/// stay those in the image.
+fn zoomed(
+    search: &Search,
+    matches: &[Correspondence],
+    log_factor: f64,
+) -> (Search, Vec<Correspondence>) {
+    let factor = log_factor.exp();
+    let matches = matches.iter().map(|match_| Correspondence {
+        plane: match_.plane / factor,
+        ..*match_
+    });
+    let search = Search {
+        focal_px: search.focal_px * factor,
+        ..*search
+    };
+    (search, matches.collect())
 }
 
 /// Normal equations of a Gauss–Newton step of pose and logarithmic focal length.
@@ -121,8 +130,8 @@ fn normal_equations(
             continue;
         }
 
-        // A longer focal length moves the point on the plane at depth 1 to the center.
-        let by_focal = match_.plane * search.focal_px;
+        // A longer focal length moves the projected point away from the center.
+        let by_focal = match_.plane * search.focal_px - row.residual;
         let mut by_step = SMatrix::<f64, 2, 7>::zeros();
         by_step.fixed_columns_mut::<6>(0).copy_from(&row.by_step);
         by_step.column_mut(6).copy_from(&by_focal);

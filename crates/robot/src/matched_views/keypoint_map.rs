@@ -128,7 +128,7 @@ impl KeypointMap {
 
 /// Triangulates the keypoints of a room's frames, frame by frame.
 pub struct Mapping<'a> {
-    frames: Vec<PosedKeypoints<'a>>,
+    pub(super) frames: Vec<PosedKeypoints<'a>>,
     camera: CameraIntrinsics,
     basis: DescriptorBasis,
     unit_m: f64,
@@ -182,12 +182,12 @@ impl<'a> Mapping<'a> {
         self.frames.len()
     }
 
-    /// The keypoints of the frame in `row`.
-    fn map_frame(&self, row: usize) -> MappedKeypoints {
+    /// The keypoints of the frame in `row`, triangulated from the neighbors that `is_used` keeps.
+    pub(super) fn map_frame(&self, row: usize, is_used: &dyn Fn(usize) -> bool) -> MappedKeypoints {
         let frame = &self.frames[row];
         let compressed = self.basis.compress(frame.keypoints);
         let mut mapped = MappedKeypoints::default();
-        let triangulated = self.triangulated(row);
+        let triangulated = self.triangulated(row, is_used);
         for point in triangulated.iter().take(self.parameters.max_keypoints) {
             mapped.points.push(frame.keypoints.points()[point.place]);
             mapped.inverse_depths.push(point.inverse_depth as f32);
@@ -201,11 +201,11 @@ impl<'a> Mapping<'a> {
     }
 
     /// Maps all frames, on the threads of the calling rayon pool. `done` is called after each frame.
-    pub fn map(self, done: &(dyn Fn() + Sync)) -> KeypointMap {
+    pub fn map(&self, done: &(dyn Fn() + Sync)) -> KeypointMap {
         let frames = (0..self.frames.len())
             .into_par_iter()
             .map(|row| {
-                let frame = self.map_frame(row);
+                let frame = self.map_frame(row, &|_| true);
                 done();
                 frame
             })
@@ -216,14 +216,18 @@ impl<'a> Mapping<'a> {
             unit_m: self.unit_m,
             epipolar_px: self.epipolar_px,
             noise: MapNoise::TYPICAL,
-            basis: self.basis,
+            basis: self.basis.clone(),
             frames,
         }
     }
 
-    fn triangulated(&self, row: usize) -> Vec<super::triangulation::Triangulated> {
+    fn triangulated(
+        &self,
+        row: usize,
+        is_used: &dyn Fn(usize) -> bool,
+    ) -> Vec<super::triangulation::Triangulated> {
         let neighbors: Vec<&PosedKeypoints<'_>> = self
-            .neighbors(row)
+            .neighbors(row, is_used)
             .into_iter()
             .map(|row| &self.frames[row])
             .collect();
@@ -238,7 +242,7 @@ impl<'a> Mapping<'a> {
 
     /// Whether no frame has a neighbor.
     fn has_no_neighbors(&self) -> bool {
-        (0..self.frames.len()).all(|row| self.neighbors(row).is_empty())
+        (0..self.frames.len()).all(|row| self.neighbors(row, &|_| true).is_empty())
     }
 
     /// Sets the unit to the median depth of the keypoints of some frames.
@@ -247,7 +251,7 @@ impl<'a> Mapping<'a> {
         for _ in 0..UNIT_ROUNDS {
             let rows = (0..self.frames.len()).step_by(every);
             let depths: Vec<f64> = rows
-                .flat_map(|row| self.triangulated(row))
+                .flat_map(|row| self.triangulated(row, &|_| true))
                 .map(|point| point.inverse_depth.recip())
                 .collect();
             if depths.len() < MIN_UNIT_KEYPOINTS {
@@ -259,8 +263,9 @@ impl<'a> Mapping<'a> {
         }
     }
 
-    /// Frames near the one in `row` that see the same scene from another place, the best first.
-    fn neighbors(&self, row: usize) -> Vec<usize> {
+    /// Frames near the one in `row` that see the same scene from another place, the best first, among
+    /// those that `is_used` keeps.
+    fn neighbors(&self, row: usize, is_used: &dyn Fn(usize) -> bool) -> Vec<usize> {
         let MappingParameters {
             neighbors,
             baseline_range: [least, most],
@@ -277,6 +282,7 @@ impl<'a> Mapping<'a> {
             .frames
             .iter()
             .enumerate()
+            .filter(|&(other, _)| is_used(other))
             .filter_map(|(other, frame)| {
                 let baseline = distance(&frame.pose, pose);
                 if baseline <= least || baseline >= most {

@@ -35,6 +35,8 @@ pub enum Candidates<'a> {
     Similar(&'a PlaceIndex),
     /// The frames nearest to a predicted pose, `world_from_camera`.
     Near(&'a Pose),
+    /// These frames, the best first.
+    Listed(&'a [usize]),
 }
 
 /// A view whose keypoints agree with the map under one pose.
@@ -44,8 +46,6 @@ pub struct MatchedView {
     pub pose: Pose,
     /// Number of the view's keypoints that agree with the pose.
     pub inliers: usize,
-    /// Number of the view's keypoints that were matched.
-    pub matched: usize,
     /// The mapped frames with inliers, in the map's rows.
     pub frames: Vec<usize>,
     /// Spread of the inliers over the image: the product of the standard deviations of their
@@ -108,6 +108,7 @@ impl KeypointMap {
                 index.nearest(query.descriptors.view(), parameters.more_frames)
             }
             Candidates::Near(pose) => self.nearest_to(pose, poses, parameters.more_frames),
+            Candidates::Listed(rows) => rows.to_vec(),
         };
 
         let first = parameters.first_frames.min(frames.len());
@@ -127,16 +128,17 @@ impl KeypointMap {
     }
 
     /// Distance between two camera poses: meters over the median depth, plus radians.
-    fn distance(&self, a: &Pose, b: &Pose) -> f64 {
+    pub(super) fn distance(&self, a: &Pose, b: &Pose) -> f64 {
         let between = a.inv_mul(b);
         between.translation.vector.norm() / self.unit_m + between.rotation.angle()
     }
 
-    /// Rows of the `count` frames nearest to a pose, the nearest first.
+    /// Rows of the `count` frames with keypoints nearest to a pose, the nearest first.
     fn nearest_to(&self, pose: &Pose, poses: &[Pose], count: usize) -> Vec<usize> {
         let mut order: Vec<(f64, usize)> = poses
             .iter()
             .enumerate()
+            .filter(|&(row, _)| !self.frames[row].is_empty())
             .map(|(row, mapped)| (self.distance(mapped, pose), row))
             .collect();
         order.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -214,10 +216,6 @@ impl<'a> Query<'a> {
         let inliers = || found.inliers.iter().map(|&place| &correspondences[place]);
         let unique: BTreeSet<usize> = inliers().map(|match_| match_.keypoint).collect();
         let frames: BTreeSet<usize> = inliers().map(|match_| match_.frame).collect();
-        let all: BTreeSet<usize> = correspondences
-            .iter()
-            .map(|match_| match_.keypoint)
-            .collect();
         let matches = found
             .inliers
             .iter()
@@ -239,7 +237,6 @@ impl<'a> Query<'a> {
         Some(MatchedView {
             pose: found.pose,
             inliers: unique.len(),
-            matched: all.len(),
             frames: frames.into_iter().collect(),
             spread: spread(self.points, &unique),
             information: PoseInformation {

@@ -22,7 +22,7 @@ pub use descriptors::{COMPRESSED, DescriptorBasis};
 pub use focal_fit::FocalFit;
 pub use keypoint_map::{KeypointMap, MappedKeypoints, Mapping, epipolar_pairs};
 pub use matching::{Candidates, InlierMatch, MatchedView, ViewKeypoints};
-pub use noise::{Trial, TrialRecording, fitted_noise, squared_length, trials};
+pub use noise::{Trial, fitted_noise, squared_length, trials};
 pub use parameters::{FocalGate, MappingParameters, MatchingParameters};
 pub use retrieval::PlaceIndex;
 

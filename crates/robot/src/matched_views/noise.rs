@@ -1,20 +1,31 @@
-//! Measures the noise of a map: trials map a part of its frames, estimate the poses of the others,
-//! and the noise under which the errors are most probable is found.
+//! Measures the noise of a map. Trials locate mapped frames as if a part of the map around them were
+//! missing; the noise under which their errors are most probable is found.
 
 use nalgebra::{Cholesky, Matrix6, Vector4, Vector6};
+use rayon::prelude::*;
 
 use super::absolute_pose::{MapNoise, PoseInformation};
-use super::keypoint_map::{KeypointMap, Mapping};
+use super::descriptors::unpacked;
+use super::keypoint_map::{KeypointMap, MappedKeypoints, Mapping};
 use super::matching::{Candidates, ViewKeypoints};
-use super::parameters::{MappingParameters, MatchingParameters};
+use super::parameters::MatchingParameters;
 use super::retrieval::PlaceIndex;
-use seese3_core::geometry::{CameraIntrinsics, Pose, log};
-use seese3_core::keypoints::Keypoints;
+use seese3_core::geometry::{Pose, log};
+use seese3_core::statistics::quantile;
 
-/// Number of views of each trial.
-const VIEWS: usize = 80;
-/// Minimum number of trial views from which a noise is fitted.
+/// Maximum number of trials, in all and for each view.
+const TRIALS: usize = 300;
+const HOLES_PER_VIEW: usize = 4;
+/// Minimum number of trials from which a noise is fitted.
 const MIN_TRIALS: usize = 30;
+/// Largest radius of a hole, units (median depths) plus radians.
+const LARGEST_HOLE: f64 = 0.6;
+/// The golden ratio: its multiples are evenly spaced modulo 1.
+const GOLDEN: f64 = 1.618_033_988_75;
+/// Share of the trials whose errors an ellipsoid holds, and that quantile of χ² with six degrees of
+/// freedom. The errors have heavier tails than a Gaussian; the quantile is that of the tail.
+const HELD: f64 = 0.95;
+const CHI_SQUARED: f64 = 12.591_587;
 /// Degrees of freedom of the Student's t distribution of the errors.
 const DEGREES_OF_FREEDOM: f64 = 5.0;
 /// The search multiplies or divides each number by this factor, which shrinks when no step helps.
@@ -22,17 +33,6 @@ const FIRST_FACTOR: f64 = 2.0;
 const LAST_FACTOR: f64 = 1.02;
 /// Range of each number, times that of [`MapNoise::TYPICAL`].
 const RANGE: [f64; 2] = [0.03, 30.0];
-
-/// A recording from which trials are made. All slices have one entry per frame.
-#[derive(Debug, Clone, Copy)]
-pub struct TrialRecording<'a> {
-    /// `world_from_camera`.
-    pub poses: &'a [Pose],
-    /// Keypoints.
-    pub keypoints: &'a [Keypoints],
-    /// The camera.
-    pub camera: CameraIntrinsics,
-}
 
 /// An estimated pose and its error.
 #[derive(Debug, Clone)]
@@ -43,123 +43,136 @@ pub struct Trial {
     pub information: PoseInformation,
 }
 
-/// Which frames a trial leaves out of its map, besides every second frame, and which views it asks
-/// for.
-///
-/// Views within a gap have mapped frames on both sides. Beyond an end of the map they have them on one
-/// side, like those of a robot that leaves the map, and their errors are larger.
+/// The frames that are missing in a trial: the view's own frame, those within a radius of it and, in
+/// some trials, the later or the earlier ones too, as for a robot that leaves the map.
 #[derive(Debug, Clone, Copy)]
-enum LeftOut {
-    /// Nothing else; every second frame is asked for.
-    Interleaved,
-    /// Every fifth of this many blocks, from the given one on.
-    Blocks { count: usize, first: usize },
-    /// The last two fifths; the first half of them is asked for.
-    End,
-    /// The first two fifths; the last half of them is asked for.
-    Beginning,
+struct Hole {
+    /// Row of the view.
+    row: usize,
+    /// Units (median depths) plus radians; 0 if only the view's own frame is missing.
+    radius: f64,
+    missing: Missing,
 }
 
-/// Trials with small and with large gaps in the map.
-const PATTERNS: [LeftOut; 5] = [
-    LeftOut::Interleaved,
-    LeftOut::Blocks {
-        count: 20,
-        first: 0,
-    },
-    LeftOut::Blocks {
-        count: 10,
-        first: 3,
-    },
-    LeftOut::End,
-    LeftOut::Beginning,
-];
-
-impl LeftOut {
-    /// Whether a frame is in the map.
-    fn maps(self, row: usize, frame_count: usize) -> bool {
-        let fifth = row * 5 / frame_count;
-        let is_kept = match self {
-            Self::Interleaved => true,
-            Self::Blocks { count, first } => row * count / frame_count % 5 != first,
-            Self::End => fifth < 3,
-            Self::Beginning => fifth >= 2,
-        };
-        is_kept && row.is_multiple_of(2)
-    }
-
-    /// Whether the trial asks for a frame.
-    fn asks(self, row: usize, frame_count: usize) -> bool {
-        let fifth = row * 5 / frame_count;
-        match self {
-            Self::Interleaved => row % 2 == 1,
-            Self::Blocks { count, first } => row * count / frame_count % 5 == first,
-            Self::End => fifth == 3,
-            Self::Beginning => fifth == 1,
-        }
-    }
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Missing {
+    Near,
+    NearOrLater,
+    NearOrEarlier,
 }
 
-/// Trials of all patterns with the views whose inliers are enough and spread widely enough for an
-/// accepted pose.
-pub fn trials(recording: TrialRecording<'_>) -> Vec<Trial> {
-    PATTERNS
-        .iter()
-        .flat_map(|&pattern| trials_of(recording, pattern))
-        .collect()
-}
-
-fn trials_of(recording: TrialRecording<'_>, pattern: LeftOut) -> Vec<Trial> {
-    let TrialRecording {
-        poses,
-        keypoints,
-        camera,
-    } = recording;
-    let frame_count = poses.len();
-    let rows = |keep: &dyn Fn(usize) -> bool| (0..frame_count).filter(|&row| keep(row)).collect();
-    let mapped: Vec<usize> = rows(&|row| pattern.maps(row, frame_count));
-    let asked: Vec<usize> = rows(&|row| pattern.asks(row, frame_count));
-
-    let mapped_poses: Vec<Pose> = mapped.iter().map(|&row| poses[row]).collect();
-    let mapped_keypoints: Vec<Keypoints> =
-        mapped.iter().map(|&row| keypoints[row].clone()).collect();
-    let Ok(mapping) = Mapping::new(
-        &mapped_poses,
-        &mapped_keypoints,
-        camera,
-        MappingParameters::default(),
-    ) else {
-        return Vec::new();
-    };
-
-    let map = mapping.map(&|| ());
-    let places = PlaceIndex::of(&map);
-    let parameters = MatchingParameters::default();
-    let every = asked.len().div_ceil(VIEWS).max(1);
-    asked
-        .iter()
-        .step_by(every)
-        .filter_map(|&row| {
-            let found = map.match_view(
-                ViewKeypoints {
-                    keypoints: &keypoints[row],
-                    camera: &camera,
-                },
-                Candidates::Similar(&places),
-                &mapped_poses,
-                &parameters,
-            )?;
-
-            found.is_supported(&parameters).then(|| Trial {
-                error: log(&found.pose.inv_mul(&poses[row])).to_vector(),
-                information: found.information,
-            })
+impl Hole {
+    /// The holes of all trials: views evenly spaced over the recording. A quarter has the radius 0;
+    /// the radii of the others are evenly spaced in their logarithms, from `least` on.
+    fn all(frame_count: usize, least: f64) -> impl IndexedParallelIterator<Item = Self> {
+        let count = TRIALS.min(HOLES_PER_VIEW * frame_count);
+        (0..count).into_par_iter().map(move |trial| {
+            let share = (trial as f64 * GOLDEN).fract();
+            let radius = least * (LARGEST_HOLE / least).powf(share);
+            let (missing, radius) = match trial % 4 {
+                0 => (Missing::Near, 0.0),
+                1 => (Missing::Near, radius),
+                2 => (Missing::NearOrLater, radius),
+                _ => (Missing::NearOrEarlier, radius),
+            };
+            Self {
+                row: trial * frame_count / count,
+                radius,
+                missing,
+            }
         })
-        .collect()
+    }
 }
 
-/// The noise under which the errors of the trials are most probable; `None` if there are too few
-/// trials.
+/// Trials with the views whose inliers are enough and spread widely enough for an accepted pose, on
+/// the threads of the calling rayon pool. `map` has the frames of `mapping`.
+pub fn trials(map: &KeypointMap, mapping: &Mapping<'_>) -> Vec<Trial> {
+    let poses: Vec<Pose> = mapping.frames.iter().map(|frame| frame.pose).collect();
+    let places = PlaceIndex::of(map);
+    let recording = Recording {
+        map,
+        mapping,
+        poses: &poses,
+        places: &places,
+    };
+    let least = recording.smallest_hole();
+    let found: Vec<Option<Trial>> = Hole::all(poses.len(), least)
+        .map(|hole| recording.trial(hole))
+        .collect();
+    found.into_iter().flatten().collect()
+}
+
+/// A map and the frames that it was made of.
+struct Recording<'a> {
+    map: &'a KeypointMap,
+    mapping: &'a Mapping<'a>,
+    /// `world_from_camera`.
+    poses: &'a [Pose],
+    places: &'a PlaceIndex,
+}
+
+impl Recording<'_> {
+    /// Median distance of successive frames, units plus radians.
+    fn smallest_hole(&self) -> f64 {
+        let steps: Vec<f64> = self
+            .poses
+            .windows(2)
+            .map(|pair| self.map.distance(&pair[0], &pair[1]))
+            .filter(|&distance| distance > 0.0)
+            .collect();
+        quantile(&steps, 0.5).map_or(LARGEST_HOLE, |step| step.min(LARGEST_HOLE))
+    }
+
+    fn is_in_map(&self, hole: Hole, row: usize) -> bool {
+        let is_near = self.map.distance(&self.poses[hole.row], &self.poses[row]) <= hole.radius;
+        let is_missing = match hole.missing {
+            Missing::Near => is_near,
+            Missing::NearOrLater => is_near || row > hole.row,
+            Missing::NearOrEarlier => is_near || row < hole.row,
+        };
+        !is_missing
+    }
+
+    /// Locates the view of a hole with the frames outside the hole.
+    fn trial(&self, hole: Hole) -> Option<Trial> {
+        let view = &self.mapping.frames[hole.row];
+        let parameters = MatchingParameters::default();
+        let is_used = |row: usize| self.is_in_map(hole, row);
+        let similar = self.places.nearest_among(
+            unpacked(&self.map.basis.compress(view.keypoints)).view(),
+            parameters.more_frames,
+            &is_used,
+        );
+
+        // Depths depend on the neighbors that are left, so that the frames are mapped again.
+        let mut map = KeypointMap {
+            basis: self.map.basis.clone(),
+            frames: vec![MappedKeypoints::default(); self.poses.len()],
+            ..*self.map
+        };
+        for &row in &similar {
+            map.frames[row] = self.mapping.map_frame(row, &is_used);
+        }
+        let found = map.match_view(
+            ViewKeypoints {
+                keypoints: view.keypoints,
+                camera: &map.camera,
+            },
+            Candidates::Listed(&similar),
+            self.poses,
+            &parameters,
+        )?;
+
+        let is_determined = Cholesky::new(found.information.independent).is_some();
+        (is_determined && found.is_supported(&parameters)).then(|| Trial {
+            error: log(&found.pose.inv_mul(&view.pose)).to_vector(),
+            information: found.information,
+        })
+    }
+}
+
+/// The noise under which the errors of the trials are most probable, scaled so that the 95 %
+/// ellipsoids hold 95 % of them; `None` if there are too few trials.
 pub fn fitted_noise(trials: &[Trial]) -> Option<MapNoise> {
     if trials.len() < MIN_TRIALS {
         return None;
@@ -169,7 +182,7 @@ pub fn fitted_noise(trials: &[Trial]) -> Option<MapNoise> {
         design_effect: MapNoise::TYPICAL.design_effect * logarithms.x.exp(),
         gap_scale: MapNoise::TYPICAL.gap_scale * logarithms.y.exp(),
         pose_noise: MapNoise::TYPICAL.pose_noise * logarithms.z.exp(),
-        pose_drift: MapNoise::TYPICAL.pose_drift * logarithms.w.exp(),
+        relative_error: MapNoise::TYPICAL.relative_error * logarithms.w.exp(),
     };
     let [least, most] = RANGE.map(f64::ln);
 
@@ -193,7 +206,17 @@ pub fn fitted_noise(trials: &[Trial]) -> Option<MapNoise> {
         }
     }
 
-    Some(noise_at(at))
+    let noise = noise_at(at);
+    let squared: Vec<f64> = trials
+        .iter()
+        .map(|trial| squared_length(trial, &noise).unwrap_or(f64::INFINITY))
+        .collect();
+    let factor = quantile(&squared, HELD)? / CHI_SQUARED;
+    Some(if factor.is_finite() && factor > 0.0 {
+        noise.scaled(factor)
+    } else {
+        noise
+    })
 }
 
 /// Negative logarithm of the likelihood of the errors, up to a constant.
@@ -227,9 +250,10 @@ pub fn squared_length(trial: &Trial, noise: &MapNoise) -> Option<f64> {
 }
 
 impl KeypointMap {
-    /// Replaces the noise by the one measured in trials; keeps it if there are too few trials.
-    pub fn measure_noise(&mut self, recording: TrialRecording<'_>) {
-        if let Some(noise) = fitted_noise(&trials(recording)) {
+    /// Replaces the noise by the one measured in trials; keeps it if there are too few trials. The map
+    /// has the frames of `mapping`.
+    pub fn measure_noise(&mut self, mapping: &Mapping<'_>) {
+        if let Some(noise) = fitted_noise(&trials(self, mapping)) {
             self.noise = noise;
         }
     }

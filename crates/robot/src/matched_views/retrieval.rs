@@ -53,9 +53,19 @@ impl PlaceIndex {
     /// Rows of the `count` frames most similar to a view with these compressed descriptors, the most
     /// similar first.
     pub fn nearest(&self, descriptors: ArrayView2<'_, f32>, count: usize) -> Vec<usize> {
+        self.nearest_among(descriptors, count, &|_| true)
+    }
+
+    /// As [`PlaceIndex::nearest`], among the frames that `is_used` keeps.
+    pub(super) fn nearest_among(
+        &self,
+        descriptors: ArrayView2<'_, f32>,
+        count: usize,
+        is_used: &dyn Fn(usize) -> bool,
+    ) -> Vec<usize> {
         let view = aggregated(descriptors, self.centers.view());
         let similarity = self.rows.dot(&ndarray::aview1(&view));
-        let mut order: Vec<usize> = (0..similarity.len()).collect();
+        let mut order: Vec<usize> = (0..similarity.len()).filter(|&row| is_used(row)).collect();
         let by_similarity =
             |a: &usize, b: &usize| similarity[*b].total_cmp(&similarity[*a]).then(a.cmp(b));
         if count < order.len() {

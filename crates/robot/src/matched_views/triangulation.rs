@@ -100,11 +100,11 @@ pub(super) fn triangulate(
 
     (0..frame.plane.len())
         .filter_map(|place| {
-            let seen: Vec<Seen> = views
+            let seen: Vec<NeighborMatch> = views
                 .iter()
                 .filter_map(|view| {
                     let point = view.matches[place]?;
-                    Some(Seen {
+                    Some(NeighborMatch {
                         direction: view.directions[place],
                         shift: view.shift,
                         point: *point,
@@ -122,13 +122,13 @@ pub(super) fn triangulate(
 }
 
 /// A match in one neighbor.
-struct Seen {
+struct NeighborMatch {
     direction: Vector3<f64>,
     shift: Vector3<f64>,
     point: Vector2<f64>,
 }
 
-impl Seen {
+impl NeighborMatch {
     /// Reprojection error in pixels, its derivative by the inverse depth, and the depth in the
     /// neighbor in units of the depth in the frame.
     fn error(&self, inverse_depth: f64, focal_px: f64) -> (Vector2<f64>, Vector2<f64>, f64) {
@@ -143,7 +143,7 @@ impl Seen {
 /// The inverse depth with the smallest robust reprojection error, and its relative deviation;
 /// `None` if no neighbor agrees or the deviation is too large.
 fn depth(
-    seen: &[Seen],
+    seen: &[NeighborMatch],
     focal_px: f64,
     unit_m: f64,
     parameters: &MappingParameters,
@@ -157,7 +157,7 @@ fn depth(
     let [least, most] = INVERSE_DEPTHS;
     let ratio = (most / least).powf(1.0 / (DEPTHS - 1) as f64);
     let cost = |inverse_depth: f64| -> f64 {
-        let of = |match_: &Seen| {
+        let of = |match_: &NeighborMatch| {
             let (error, _, z) = match_.error(inverse_depth, focal_px);
             if z > 1e-3 {
                 error.norm_squared().min(gate)

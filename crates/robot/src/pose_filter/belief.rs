@@ -1,4 +1,4 @@
-//! A Gaussian on a camera's pose, its velocity, and the lasting errors of its sensors.
+//! A Gaussian on a camera's pose, its velocity, and the correlated errors of its sensors.
 
 use nalgebra::{Cholesky, Matrix6, SMatrix, SVector, Vector6};
 
@@ -23,17 +23,17 @@ const DRIVEN_NOISE_RAD: f64 = 5e-3;
 /// Rows of the blocks of the state.
 const POSE: usize = 0;
 const VELOCITY: usize = 6;
-const LASTING: usize = 12;
+const CORRELATED: usize = 12;
 const WHEELS: usize = 18;
 
 /// Rows of the blocks of [`Step`].
 const START: usize = 0;
 const MOTION: usize = 6;
 const END_VELOCITY: usize = 12;
-const END_LASTING: usize = 18;
+const END_CORRELATED: usize = 18;
 const END_WHEELS: usize = 24;
 
-/// Pose, velocity, and the lasting errors of located poses and of wheel odometry, with the covariance
+/// Pose, velocity, and the correlated errors of located poses and of wheel odometry, with the covariance
 /// of the errors of all four.
 ///
 /// The pose error δ is in the body frame, true = pose · exp(δ), ordered (v, ω), in meters and
@@ -46,11 +46,11 @@ pub struct Belief {
     /// In the camera's body frame, meters and radians per second.
     pub velocity: Twist,
     /// Lasting error of located poses, in standard deviations of each pose.
-    pub lasting: Vector6<f64>,
+    pub correlated_error: Vector6<f64>,
     /// Errors of wheel odometry, in standard deviations of its drift: scale of the translations, scale
     /// of the rotations, and rotation about each axis per meter.
     pub wheels: SVector<f64, WHEEL_ERRORS>,
-    /// Of (pose, velocity, lasting error, wheel error); symmetric and positive definite.
+    /// Of (pose, velocity, correlated error, wheel error); symmetric and positive definite.
     #[cfg_attr(
         feature = "serde",
         serde(with = "seese3_core::matrices::upper_triangle")
@@ -65,15 +65,15 @@ pub fn origin() -> PoseWithCovariance {
 
 /// The belief over one step of time, while observations are added.
 ///
-/// The error state is (initial pose, motion, final velocity, final lasting error, wheel error). The
+/// The error state is (initial pose, motion, final velocity, final correlated error, wheel error). The
 /// motion's error is in the final body frame.
 pub struct Step {
     /// The initial pose.
     start: Pose,
-    /// Expected motion, final velocity and final lasting error, before any observation.
+    /// Expected motion, final velocity and final correlated error, before any observation.
     motion: Pose,
     velocity: Vector6<f64>,
-    lasting: Vector6<f64>,
+    correlated_error: Vector6<f64>,
     wheels: SVector<f64, WHEEL_ERRORS>,
     covariance: JointMatrix,
 }
@@ -89,20 +89,20 @@ pub struct Observation {
 impl Belief {
     /// A state with a known pose and unknown velocity: zero, with the covariance of the prior.
     ///
-    /// `lasting_share` is the share of the pose's variance that is the lasting error of located
+    /// `correlated_share` is the share of the pose's variance that is the correlated error of located
     /// poses; 0 for a pose from another source.
-    pub fn at(place: &PoseWithCovariance, prior: &MotionPrior, lasting_share: f64) -> Self {
+    pub fn at(place: &PoseWithCovariance, prior: &MotionPrior, correlated_share: f64) -> Self {
         let mut covariance = StateMatrix::zeros();
         let mut block = |row: usize, column: usize, of: &Matrix6<f64>| {
             covariance.fixed_view_mut::<6, 6>(row, column).copy_from(of);
         };
 
-        let scale = lasting_scale(place, lasting_share);
+        let scale = correlated_scale(place, correlated_share);
         block(POSE, POSE, &place.covariance);
-        block(POSE, LASTING, &scale);
-        block(LASTING, POSE, &scale.transpose());
+        block(POSE, CORRELATED, &scale);
+        block(CORRELATED, POSE, &scale.transpose());
         block(VELOCITY, VELOCITY, &prior.velocity_covariance());
-        block(LASTING, LASTING, &Matrix6::identity());
+        block(CORRELATED, CORRELATED, &Matrix6::identity());
         covariance
             .fixed_view_mut::<WHEEL_ERRORS, WHEEL_ERRORS>(WHEELS, WHEELS)
             .fill_with_identity();
@@ -110,7 +110,7 @@ impl Belief {
         Self {
             pose: place.pose,
             velocity: Twist::default(),
-            lasting: Vector6::zeros(),
+            correlated_error: Vector6::zeros(),
             wheels: SVector::zeros(),
             covariance,
         }
@@ -131,36 +131,36 @@ impl Belief {
 
     /// Predicts the state some seconds later.
     ///
-    /// The velocity is the Ornstein–Uhlenbeck process of `prior`, the lasting error one with the
+    /// The velocity is the Ornstein–Uhlenbeck process of `prior`, the correlated error one with the
     /// correlation time of the parameters.
     pub fn step(&self, prior: &MotionPrior, seconds: f64, parameters: &FilterParameters) -> Step {
         let drift = prior.over(&self.velocity, seconds);
-        let lasts = (-seconds / parameters.lasting_s).exp();
+        let decay = (-seconds / parameters.correlation_time_s).exp();
 
-        let mut spread = SMatrix::<f64, JOINT, STATE>::zeros();
+        let mut transition = SMatrix::<f64, JOINT, STATE>::zeros();
         for axis in 0..6 {
             let part = axis / 3;
-            spread[(START + axis, POSE + axis)] = 1.0;
-            spread[(MOTION + axis, VELOCITY + axis)] = drift.reach_s[part];
-            spread[(END_VELOCITY + axis, VELOCITY + axis)] = drift.left[part];
-            spread[(END_LASTING + axis, LASTING + axis)] = lasts;
+            transition[(START + axis, POSE + axis)] = 1.0;
+            transition[(MOTION + axis, VELOCITY + axis)] = drift.reach_s[part];
+            transition[(END_VELOCITY + axis, VELOCITY + axis)] = drift.left[part];
+            transition[(END_CORRELATED + axis, CORRELATED + axis)] = decay;
         }
         for error in 0..WHEEL_ERRORS {
-            spread[(END_WHEELS + error, WHEELS + error)] = 1.0;
+            transition[(END_WHEELS + error, WHEELS + error)] = 1.0;
         }
 
-        let mut covariance = spread * self.covariance * spread.transpose();
+        let mut covariance = transition * self.covariance * transition.transpose();
         let mut of_drift = covariance.fixed_view_mut::<12, 12>(MOTION, MOTION);
-        of_drift += drift.noise * parameters.abruptness;
-        for axis in END_LASTING..END_WHEELS {
-            covariance[(axis, axis)] += 1.0 - lasts * lasts;
+        of_drift += drift.noise * parameters.process_noise_factor;
+        for axis in END_CORRELATED..END_WHEELS {
+            covariance[(axis, axis)] += 1.0 - decay * decay;
         }
 
         Step {
             start: self.pose,
             motion: exp(&drift.motion),
             velocity: drift.velocity.to_vector(),
-            lasting: self.lasting * lasts,
+            correlated_error: self.correlated_error * decay,
             wheels: self.wheels,
             covariance,
         }
@@ -170,28 +170,28 @@ impl Belief {
 impl Step {
     /// The observation of a located pose.
     ///
-    /// Its error is L (√ρ · lasting error + √(1 − ρ) · noise) with L Lᵀ its covariance and the
-    /// lasting share ρ.
+    /// Its error is L (√ρ · correlated error + √(1 − ρ) · noise) with L Lᵀ its covariance and the
+    /// correlated share ρ.
     pub fn located(
         &self,
         located: &PoseWithCovariance,
         parameters: &FilterParameters,
     ) -> Observation {
-        let scale = lasting_scale(located, parameters.lasting_share);
+        let scale = correlated_scale(located, parameters.correlated_share);
         let mut derivative = Observed::zeros();
         let mut block = |column: usize, of: &Matrix6<f64>| {
             derivative.fixed_view_mut::<6, 6>(0, column).copy_from(of);
         };
         block(START, &adjoint(&self.motion.inverse()));
         block(MOTION, &Matrix6::identity());
-        block(END_LASTING, &-scale);
+        block(END_CORRELATED, &-scale);
 
         let expected = self.start * self.motion;
         let difference = log(&expected.inv_mul(&located.pose)).to_vector();
         Observation {
-            residual: difference + scale * self.lasting,
+            residual: difference + scale * self.correlated_error,
             derivative,
-            noise: located.covariance * (1.0 - parameters.lasting_share),
+            noise: located.covariance * (1.0 - parameters.correlated_share),
         }
     }
 
@@ -200,7 +200,7 @@ impl Step {
     /// The drift is a scale error of translations, a scale error of rotations, and a rotation per meter
     /// forward, as those of a wrong wheel radius, a wrong track width and unequal wheels. The optical
     /// axis points forward.
-    pub fn driven(&self, motion: &Pose, drift: &Drift) -> Observation {
+    pub fn by_wheels(&self, motion: &Pose, drift: &Drift) -> Observation {
         let Twist { linear, angular } = log(motion);
         let distance_m = linear.norm();
         let mut of_wheels = SMatrix::<f64, 6, WHEEL_ERRORS>::zeros();
@@ -234,7 +234,7 @@ impl Step {
 
     /// Squared Mahalanobis length of the innovation: χ² with six degrees of freedom if all
     /// covariances are correct. Infinite if the sum of the covariances is not positive definite.
-    pub fn surprise(&self, observed: &Observation) -> f64 {
+    pub fn squared_innovation(&self, observed: &Observation) -> f64 {
         let innovation = observed.residual;
         let sum = Cholesky::new(self.innovation_covariance(observed));
         sum.map_or(f64::INFINITY, |sum| innovation.dot(&sum.solve(&innovation)))
@@ -256,7 +256,7 @@ impl Step {
         self.start *= exp(&Twist::from_vector(&part(START)));
         self.motion *= exp(&Twist::from_vector(&part(MOTION)));
         self.velocity += part(END_VELOCITY);
-        self.lasting += part(END_LASTING);
+        self.correlated_error += part(END_CORRELATED);
         self.wheels += change.fixed_rows::<WHEEL_ERRORS>(END_WHEELS);
 
         // Joseph's form: (I − K H) P (I − K H)ᵀ + K R Kᵀ.
@@ -284,7 +284,7 @@ impl Step {
         for axis in 0..6 {
             merged[(POSE + axis, MOTION + axis)] = 1.0;
             merged[(VELOCITY + axis, END_VELOCITY + axis)] = 1.0;
-            merged[(LASTING + axis, END_LASTING + axis)] = 1.0;
+            merged[(CORRELATED + axis, END_CORRELATED + axis)] = 1.0;
         }
         for error in 0..WHEEL_ERRORS {
             merged[(WHEELS + error, END_WHEELS + error)] = 1.0;
@@ -294,7 +294,7 @@ impl Step {
         Belief {
             pose: self.start * self.motion,
             velocity: Twist::from_vector(&self.velocity),
-            lasting: self.lasting,
+            correlated_error: self.correlated_error,
             wheels: self.wheels,
             covariance: (covariance + covariance.transpose()) * 0.5,
         }
@@ -314,7 +314,7 @@ pub fn twist_covariance(motion: &PoseWithCovariance) -> Matrix6<f64> {
 }
 
 /// √ρ L, with L Lᵀ the covariance of a located pose; zero if that is not positive definite.
-fn lasting_scale(located: &PoseWithCovariance, lasting_share: f64) -> Matrix6<f64> {
+fn correlated_scale(located: &PoseWithCovariance, correlated_share: f64) -> Matrix6<f64> {
     let root = Cholesky::new(located.covariance).map_or_else(Matrix6::zeros, |root| root.unpack());
-    root * lasting_share.sqrt()
+    root * correlated_share.sqrt()
 }

@@ -7,7 +7,7 @@
 //! - The error of a located pose is the sum of a time-correlated part and white noise; see [`Belief`].
 //!   The filter does not average the correlated part out.
 //! - A located pose that contradicts the belief is not used. Two in a row that agree replace it.
-//! - `odom_from_camera` composes the motions of the steps, in which lasting errors cancel. It is
+//! - `odom_from_camera` composes the motions of the steps, in which correlated errors cancel. It is
 //!   continuous and drifts.
 
 mod belief;
@@ -29,23 +29,23 @@ use seese3_core::room::{FrameId, Room};
 /// Parameters of a filter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FilterParameters {
-    /// Share of the variance of a located pose that lasts from view to view, 0 to 1.
-    pub lasting_share: f64,
+    /// Share of the variance of a located pose that is correlated from view to view, 0 to 1.
+    pub correlated_share: f64,
     /// Correlation time of that part, seconds.
-    pub lasting_s: f64,
+    pub correlation_time_s: f64,
     /// Factor on the process noise of the motion prior: a person turns and stops more abruptly than
     /// a Gaussian process.
-    pub abruptness: f64,
+    pub process_noise_factor: f64,
     /// Squared Mahalanobis length of an innovation above which a located pose counts less: its
-    /// covariance grows with the square of the excess.
+    /// covariance is multiplied by the square of length / gate.
     pub gate: f64,
-    /// The same above which it is not used.
-    pub max_surprise: f64,
+    /// Squared Mahalanobis length of an innovation above which a located pose is not used.
+    pub outlier_gate: f64,
     /// Number of consecutive located poses that must agree to start the tracking, or to replace a
     /// pose that they contradict.
     pub views_to_agree: u32,
-    /// Longest time between two such poses, seconds. After a longer one, a pose that agrees with an
-    /// uncertain belief needs another one too.
+    /// Maximum time between two such poses, seconds. After a longer gap, an uncertain belief needs
+    /// `views_to_agree` poses again.
     pub max_candidate_s: f64,
     /// Time without a located view after which a stream is DEGRADED, seconds.
     pub max_unlocated_s: f64,
@@ -60,12 +60,12 @@ pub struct FilterParameters {
 impl Default for FilterParameters {
     fn default() -> Self {
         Self {
-            lasting_share: 0.7,
-            lasting_s: 0.3,
-            abruptness: 8.0,
+            correlated_share: 0.7,
+            correlation_time_s: 0.3,
+            process_noise_factor: 8.0,
             // The 99 % quantile of χ² with six degrees of freedom, and four times that.
             gate: 16.81,
-            max_surprise: 67.24,
+            outlier_gate: 67.24,
             views_to_agree: 2,
             max_candidate_s: 5.0,
             max_unlocated_s: 0.35,
@@ -157,7 +157,7 @@ impl PoseFilter {
     ) -> Result<Update, Refusal> {
         let seconds = state.seconds_to(frame)?;
         let is_first = state.last.is_none();
-        let driven = frame.measured.zip(state.driven_to(frame));
+        let wheel_motion = frame.measured.zip(state.wheel_motion_to(frame));
         state.advance(frame);
         state.expire_candidate(frame, self.parameters.max_candidate_s);
 
@@ -165,17 +165,18 @@ impl PoseFilter {
         let prior = &self.rooms[state.room.unwrap_or(0)].motion_prior;
         let belief = state.belief.unwrap_or_else(|| Belief::at_origin(prior));
         let mut step = belief.step(prior, seconds, &self.parameters);
-        if let Some((measured, motion)) = driven {
-            step.update(&step.driven(&motion, &measured.drift), 1.0);
-            state.driven = state.driven.and(log(&motion));
+        if let Some((measured, motion)) = wheel_motion {
+            step.update(&step.by_wheels(&motion, &measured.drift), 1.0);
+            state.wheel_motion = state.wheel_motion.and(log(&motion));
         }
 
         // 2. Correct. An identical image holds nothing new.
         let is_new = self.parameters.fuse && state.unchanged_frames == 0;
         let matched = frame.matched.filter(|_| is_new);
-        let surprise = matched.and_then(|matched| self.surprise(state, &step, &matched));
+        let squared_innovation =
+            matched.and_then(|matched| self.squared_innovation(state, &step, &matched));
         let correction = match &matched {
-            Some(matched) => self.correct(state, &mut step, frame, matched, surprise),
+            Some(matched) => self.correct(state, &mut step, frame, matched, squared_innovation),
             None => Correction::Unused,
         };
 
@@ -209,7 +210,7 @@ impl PoseFilter {
             best_match: matched.map(|matched| (matched.room, matched.best_match())),
             best_camera: None,
             match_used: correction != Correction::Unused,
-            surprise,
+            surprise: squared_innovation,
             candidate: state.candidate.as_ref().map(FilterCandidate::reported),
             anchors_needed: self.parameters.views_to_agree,
         })
@@ -217,15 +218,16 @@ impl PoseFilter {
 
     /// Corrects the step by a located pose.
     ///
-    /// Without a belief, or if the pose contradicts it, the pose supports a candidate. So it does if no
-    /// view was located for a while and the belief is uncertain: almost any pose agrees with it.
+    /// Without a belief, or if the pose contradicts it, the pose supports a candidate. The same applies
+    /// if no view was located recently and the belief is uncertain, because almost any pose passes the
+    /// gate then.
     fn correct(
         &self,
         state: &mut FilterState,
         step: &mut Step,
         frame: &ViewObservation,
         matched: &MatchedPose,
-        surprise: Option<f64>,
+        squared_innovation: Option<f64>,
     ) -> Correction {
         let parameters = &self.parameters;
         let earlier = state.candidate.take();
@@ -235,10 +237,12 @@ impl PoseFilter {
             .located_ns
             .is_some_and(|located| seconds(located) <= parameters.max_candidate_s);
         let is_certain = is_recent || step.end().place().tells_a_place();
-        let surprise = surprise.filter(|_| is_certain).unwrap_or(f64::INFINITY);
-        if surprise <= parameters.max_surprise {
+        let squared_innovation = squared_innovation
+            .filter(|_| is_certain)
+            .unwrap_or(f64::INFINITY);
+        if squared_innovation <= parameters.outlier_gate {
             // Errors have heavier tails than a Gaussian.
-            let factor = (surprise / parameters.gate).max(1.0).powi(2);
+            let factor = (squared_innovation / parameters.gate).max(1.0).powi(2);
             let observed = step.located(&matched.pose, parameters);
             step.update(&observed, factor);
             state.located_ns = Some(frame.time_ns);
@@ -249,7 +253,7 @@ impl PoseFilter {
             .and_then(|candidate| self.supported(&candidate, frame, matched))
             .unwrap_or_else(|| {
                 let prior = &self.rooms[matched.room].motion_prior;
-                let belief = Belief::at(&matched.pose, prior, parameters.lasting_share);
+                let belief = Belief::at(&matched.pose, prior, parameters.correlated_share);
                 (belief, 1)
             });
         if agreeing >= parameters.views_to_agree {
@@ -286,7 +290,7 @@ impl PoseFilter {
         let prior = &self.rooms[candidate.room].motion_prior;
         let mut step = candidate.belief.step(prior, seconds, parameters);
         let observed = step.located(&matched.pose, parameters);
-        let agrees = step.surprise(&observed) <= parameters.gate;
+        let agrees = step.squared_innovation(&observed) <= parameters.gate;
         agrees.then(|| {
             step.update(&observed, 1.0);
             (step.end(), candidate.agreeing + 1)
@@ -295,8 +299,13 @@ impl PoseFilter {
 
     /// Squared Mahalanobis length of the innovation of a located pose, if there is a belief in its
     /// room.
-    fn surprise(&self, state: &FilterState, step: &Step, matched: &MatchedPose) -> Option<f64> {
+    fn squared_innovation(
+        &self,
+        state: &FilterState,
+        step: &Step,
+        matched: &MatchedPose,
+    ) -> Option<f64> {
         let is_here = state.is_placed && state.room == Some(matched.room);
-        is_here.then(|| step.surprise(&step.located(&matched.pose, &self.parameters)))
+        is_here.then(|| step.squared_innovation(&step.located(&matched.pose, &self.parameters)))
     }
 }

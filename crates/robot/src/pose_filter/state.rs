@@ -43,7 +43,7 @@ pub struct FilterState {
     /// `odom_from_camera`, without the drift of wheel odometry in its covariance.
     pub odom: PoseWithCovariance,
     /// Wheel odometry since the start of the stream, for that drift.
-    pub driven: OdometryDelta,
+    pub wheel_motion: OdometryDelta,
     /// The last frame with wheel odometry.
     pub measured: Option<OdometryMark>,
     /// The keyframe of reported motions.
@@ -117,7 +117,7 @@ impl FilterState {
             belief: None,
             is_placed: false,
             odom: origin(),
-            driven: OdometryDelta::zero(),
+            wheel_motion: OdometryDelta::zero(),
             measured: None,
             keyframe: None,
             candidate: None,
@@ -150,7 +150,7 @@ impl FilterState {
     }
 
     /// The motion since the last frame by wheel odometry, `last_from_this`, if both frames have it.
-    pub(super) fn driven_to(&self, frame: &ViewObservation) -> Option<Pose> {
+    pub(super) fn wheel_motion_to(&self, frame: &ViewObservation) -> Option<Pose> {
         let measured = self.measured.filter(|mark| mark.is_last)?;
         let motion = measured.pose.inv_mul(&frame.measured?.pose);
         log(&motion).is_unique_logarithm().then_some(motion)
@@ -179,7 +179,7 @@ impl FilterState {
                 translation_share: mark.translation_share,
                 rotation_share: mark.rotation_share,
             };
-            drift.over(self.driven)
+            drift.over(self.wheel_motion)
         });
         PoseWithCovariance {
             covariance: self.odom.covariance + drift,

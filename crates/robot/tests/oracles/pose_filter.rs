@@ -13,10 +13,10 @@ use seese3_robot::tracking::{
 
 const PERIOD_NS: i64 = 33_333_333;
 
-fn parameters(lasting_share: f64, lasting_s: f64) -> FilterParameters {
+fn parameters(correlated_share: f64, correlation_time_s: f64) -> FilterParameters {
     FilterParameters {
-        lasting_share,
-        lasting_s,
+        correlated_share,
+        correlation_time_s,
         ..FilterParameters::default()
     }
 }
@@ -67,10 +67,10 @@ fn error_m(update: &Update, pose: &Pose) -> f64 {
     PoseError::between(&update.map_pose.unwrap().pose, pose).translation_m
 }
 
-/// Oracle: the definition of a lasting error. Two poses of a camera at rest, located with the same
+/// Oracle: the definition of a correlated error. Two poses of a camera at rest, located with the same
 /// error, tell its place no better than one; with independent errors, the variance halves.
 #[test]
-fn lasting_errors_are_not_averaged_out() {
+fn correlated_errors_are_not_averaged_out() {
     let prior = MotionPrior::assumed();
     let pose = located(Pose::identity(), 0.01);
     let variance_after_two = |share: f64| {
@@ -86,9 +86,9 @@ fn lasting_errors_are_not_averaged_out() {
     assert!((variance_after_two(0.5) / 0.75e-4 - 1.0).abs() < 1e-9);
 }
 
-/// Oracle: the same definition. A lasting error is that of both ends of a motion, so it cancels.
+/// Oracle: the same definition. A correlated error is that of both ends of a motion, so it cancels.
 #[test]
-fn lasting_errors_cancel_in_a_motion() {
+fn correlated_errors_cancel_in_a_motion() {
     let prior = MotionPrior::assumed();
     let parameters = parameters(1.0 - 1e-9, 1e9);
     let error = exp(&Twist {
@@ -100,7 +100,7 @@ fn lasting_errors_cancel_in_a_motion() {
     let belief = Belief::at(
         &located(start * error, 0.02),
         &prior,
-        parameters.lasting_share,
+        parameters.correlated_share,
     );
     let mut step = belief.step(&prior, 0.1, &parameters);
     step.update(&step.located(&located(end * error, 0.02), &parameters), 1.0);
@@ -129,7 +129,7 @@ fn errors_turn_with_the_camera() {
         rotation_share: 1e-4,
     };
     let mut step = Belief::at(&place, &prior, 0.0).step(&prior, 0.1, &parameters);
-    step.update(&step.driven(&turn, &drift), 1.0);
+    step.update(&step.by_wheels(&turn, &drift), 1.0);
     let end = step.end().place();
     assert!((end.covariance[(1, 1)] - 1e-2).abs() < 1e-4, "{end:?}");
     assert!(end.covariance[(0, 0)] < 1e-4);
@@ -168,7 +168,7 @@ fn wheels_carry_the_pose_and_their_errors_are_learned() {
     let truth = ways(600, [1.0, 1.0]);
     let wheels = ways(600, [1.04, 1.05]);
     let start = Pose::translation(7.0, 1.0, 0.0);
-    let driven = |number: u64, is_located: bool| {
+    let wheel_frame = |number: u64, is_located: bool| {
         let row = number as usize;
         let measured = MeasuredPose {
             pose: start * wheels[row],
@@ -184,7 +184,11 @@ fn wheels_carry_the_pose_and_their_errors_are_learned() {
     let mut state = filter.start(None);
     let mut last = None;
     for number in 0..=201 {
-        last = Some(filter.observe(&mut state, &driven(number, false)).unwrap());
+        last = Some(
+            filter
+                .observe(&mut state, &wheel_frame(number, false))
+                .unwrap(),
+        );
     }
     let update = last.take().unwrap();
     let error = PoseError::between(&update.odom.pose, &wheels[201]).translation_m;
@@ -194,13 +198,19 @@ fn wheels_carry_the_pose_and_their_errors_are_learned() {
     // Located for 3 m, then not for 3 m.
     let mut state = filter.start(None);
     for number in 0..300 {
-        filter.observe(&mut state, &driven(number, true)).unwrap();
+        filter
+            .observe(&mut state, &wheel_frame(number, true))
+            .unwrap();
     }
     let learned = state.belief.unwrap().wheels;
     assert!((learned[0] - 0.8).abs() < 0.3, "{learned}");
     assert!((learned[1] - 1.0).abs() < 0.4, "{learned}");
     for number in 300..=600 {
-        last = Some(filter.observe(&mut state, &driven(number, false)).unwrap());
+        last = Some(
+            filter
+                .observe(&mut state, &wheel_frame(number, false))
+                .unwrap(),
+        );
     }
     let update = last.unwrap();
     let pose = update.map_pose.unwrap();

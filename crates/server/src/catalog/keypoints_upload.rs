@@ -46,7 +46,7 @@ impl ReceivedKeypoints {
                 design_effect: stated.design_effect,
                 gap_scale: stated.gap_scale,
                 pose_noise: stated.pose_noise,
-                pose_drift: stated.pose_drift,
+                relative_error: stated.relative_error,
             },
         };
         header

@@ -84,8 +84,11 @@ impl Engine {
                 fits
             }
             (Self::Keypoints { state, .. }, EngineState::Keypoints(resumed)) => {
+                let candidate = resumed.candidate.as_ref().map(|candidate| candidate.room);
+                let mut named = [resumed.room, candidate].into_iter().flatten();
+                let fits = named.all(|room| room < rooms.len());
                 *state = resumed;
-                true
+                fits
             }
             _ => false,
         }

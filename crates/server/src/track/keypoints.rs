@@ -185,8 +185,10 @@ impl StreamCamera {
         };
         reasons.sort_by(|a, b| novelty(a).total_cmp(&novelty(b)));
         let why_not = reasons.first().filter(|_| best.is_none()).copied();
-        if why_not.is_some_and(|why| why.is_of_camera()) {
-            self.restart();
+        if let Self::Unknown(search) = self
+            && why_not.is_some_and(|why| why.is_of_camera())
+        {
+            search.contradict();
         }
         Ok(StreamMatch {
             why_not,

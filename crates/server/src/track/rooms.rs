@@ -82,10 +82,10 @@ impl TrackedRoom {
     }
 
     /// A stored frame as a wire message.
-    pub fn retrieved(&self, neighbour: seese3_core::index::Neighbour) -> pb::RetrievedFrame {
+    pub fn retrieved(&self, neighbor: seese3_core::index::Neighbour) -> pb::RetrievedFrame {
         let retrieved = RetrievedFrame {
-            neighbour,
-            pose: self.room.poses()[neighbour.frame.row()],
+            neighbour: neighbor,
+            pose: self.room.poses()[neighbor.frame.row()],
         };
         convert::retrieved_to_wire(&retrieved, &self.room)
     }
@@ -95,7 +95,7 @@ impl TrackedRoom {
 ///
 /// - The configuration names one.
 /// - An adapter can track in these rooms, unless the stream `was_of_keypoints` before it resumed.
-/// - Not all of the rooms have keypoints that this server can detect.
+/// - None of the rooms has keypoints that this server can detect, or a named one has none.
 ///
 /// # Errors
 /// [`Error::NotFound`] or [`Error::Invalid`] on the rooms; [`Error::Precondition`] if a named room

@@ -51,7 +51,7 @@ fn upload(name: &str) -> Upload {
         unit_m: 2.5,
         epipolar_px: 0.7,
         pose_noise: 0.001,
-        pose_drift: 0.003,
+        relative_error: 0.003,
         design_effect: 12.0,
         gap_scale: 0.3,
     });
@@ -148,7 +148,7 @@ async fn frames_that_extend_a_room_have_the_keypoints_that_are_sent() {
     let mut of_another_camera = with.clone();
     of_another_camera.spec.camera.as_mut().unwrap().fx *= 1.001;
     let answer = of_another_camera.send(&server.client).await;
-    refused("camera", answer, Code::InvalidArgument, "another camera");
+    refused("camera", answer, Code::InvalidArgument, "frames");
 
     let answer = with.send(&server.client).await.unwrap();
     assert_eq!(answer.revision.unwrap().revision, 2);
@@ -203,8 +203,8 @@ async fn unfit_keypoints_are_refused_and_leave_nothing() {
         ),
         (|u| stated(u).pose_noise = -0.1, "room.keypoints.pose_noise"),
         (
-            |u| stated(u).pose_drift = f64::INFINITY,
-            "room.keypoints.pose_drift",
+            |u| stated(u).relative_error = f64::INFINITY,
+            "room.keypoints.relative_error",
         ),
         (
             |u| stated(u).design_effect = 1e300,

@@ -312,6 +312,32 @@ async fn added_frames_bring_their_keypoints() {
     }
 }
 
+/// Oracle: the definition: frames that were added without keypoints get those that are sent later.
+#[tokio::test]
+async fn known_frames_without_keypoints_get_those_that_are_sent_again() {
+    let (_folder, store) = begun_with_260(Some(&keypoints(260, 5))).await;
+    let (frames, features) = (part(260..300), [features("f", 260..300)]);
+    let others = OtherFeatures::Required;
+    let without = RoomContents::of(&frames, &features);
+    store.extend_room(without, others).await.unwrap();
+
+    let added = keypoints(40, 7);
+    let with = RoomContents {
+        keypoints: Some(&added),
+        ..without
+    };
+    for (revision, is_new) in [(3, true), (3, false)] {
+        let published = store.extend_room(with, others).await.unwrap();
+        assert_eq!((published.revision, published.is_new), (revision, is_new));
+    }
+    let room = store.load_room("a", None).await.unwrap();
+    assert_eq!(room.room.frame_count(), 300);
+    let joined = room.keypoints.unwrap().map;
+    for (found, sent) in joined.frames[260..].iter().zip(&added.map.frames) {
+        assert_eq!(found.descriptors, sent.descriptors);
+    }
+}
+
 /// Oracle: the promise that nothing is lost: keypoints that do not belong to the room are refused with
 /// what to change, and nothing is published.
 #[tokio::test]
@@ -319,7 +345,8 @@ async fn added_keypoints_of_another_kind_are_refused() {
     let known = keypoints(260, 5);
     let (_folder, store) = begun_with_260(Some(&known)).await;
     let (frames, features) = (part(260..300), [features("f", 260..300)]);
-    let cases: [(fn(&mut RoomKeypoints), &str); 4] = [
+    type Change = fn(&mut RoomKeypoints);
+    let cases: [(Change, &str); 4] = [
         (|k| k.source.descriptors = "other".into(), "another encoder"),
         (
             |k| Arc::make_mut(&mut k.map).camera = distorted_camera(),
