@@ -22,10 +22,11 @@ const MIN_TRIALS: usize = 30;
 const LARGEST_HOLE: f64 = 0.6;
 /// The golden ratio: its multiples are evenly spaced modulo 1.
 const GOLDEN: f64 = 1.618_033_988_75;
-/// Share of the trials whose errors an ellipsoid holds, and that quantile of χ² with six degrees of
-/// freedom. The errors have heavier tails than a Gaussian; the quantile is that of the tail.
-const HELD: f64 = 0.95;
-const CHI_SQUARED: f64 = 12.591_587;
+/// Share of the trials whose errors the 95 % ellipsoids hold. The errors have heavier tails than a
+/// Gaussian: with 0.95, the 68 % ellipsoids would hold up to 93 % of the errors in a mapped part.
+const HELD: f64 = 0.93;
+/// The 95 % quantile of χ² with six degrees of freedom.
+const CHI_SQUARED_95: f64 = 12.591_587;
 /// Degrees of freedom of the Student's t distribution of the errors.
 const DEGREES_OF_FREEDOM: f64 = 5.0;
 /// The search multiplies or divides each number by this factor, which shrinks when no step helps.
@@ -124,7 +125,8 @@ impl Recording<'_> {
     }
 
     fn is_in_map(&self, hole: Hole, row: usize) -> bool {
-        let is_near = self.map.distance(&self.poses[hole.row], &self.poses[row]) <= hole.radius;
+        let distance = self.map.distance(&self.poses[hole.row], &self.poses[row]);
+        let is_near = row == hole.row || distance <= hole.radius;
         let is_missing = match hole.missing {
             Missing::Near => is_near,
             Missing::NearOrLater => is_near || row > hole.row,
@@ -172,7 +174,7 @@ impl Recording<'_> {
 }
 
 /// The noise under which the errors of the trials are most probable, scaled so that the 95 %
-/// ellipsoids hold 95 % of them; `None` if there are too few trials.
+/// ellipsoids hold the share [`HELD`] of them; `None` if there are too few trials.
 pub fn fitted_noise(trials: &[Trial]) -> Option<MapNoise> {
     if trials.len() < MIN_TRIALS {
         return None;
@@ -211,7 +213,7 @@ pub fn fitted_noise(trials: &[Trial]) -> Option<MapNoise> {
         .iter()
         .map(|trial| squared_length(trial, &noise).unwrap_or(f64::INFINITY))
         .collect();
-    let factor = quantile(&squared, HELD)? / CHI_SQUARED;
+    let factor = quantile(&squared, HELD)? / CHI_SQUARED_95;
     Some(if factor.is_finite() && factor > 0.0 {
         noise.scaled(factor)
     } else {

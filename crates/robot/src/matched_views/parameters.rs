@@ -126,8 +126,8 @@ impl Default for MatchingParameters {
             confident_inliers: 150,
             min_inliers: 90,
             min_support: 4.3,
-            max_position_deviation: 0.05,
-            max_rotation_deviation_rad: 3_f64.to_radians(),
+            max_position_deviation: 0.075,
+            max_rotation_deviation_rad: 4.5_f64.to_radians(),
             min_log_focal: 0.05,
             mapping_focal_gate: FocalGate {
                 max_deviations: 4.0,
