@@ -53,9 +53,11 @@ impl Push {
         }
         let client = self.server.connect().await?;
 
+        let mut has_keypoints = false;
         let (revision, created, served) = match self.name.kind {
             Kind::Room => {
                 let stored = store.load_room(&self.name.name, self.name.revision).await?;
+                has_keypoints = stored.keypoints.is_some();
                 let messages = room_messages(&stored, self.upload(&stored, &target)?)?;
                 let answer = client.create_room(tokio_stream::iter(messages)).await?;
                 (answer.revision, answer.created, answer.served)
@@ -87,6 +89,13 @@ impl Push {
             "{}: {state}",
             target.clone().at(revision.revision)
         ));
+
+        if self.extend && has_keypoints {
+            say(
+                "the covariances of matched views are still those of the map before: encode and push the whole room to \
+                 measure them again",
+            );
+        }
 
         let mut fitted_adapter = None;
         if self.refit {

@@ -141,12 +141,8 @@ fn extended(
     let features =
         joined_features(base, added_features, others).map_err(|problem| refused(problem.into()))?;
     if let Some(rows) = known_rows(base, addition, &features) {
-        let has_keypoints = |keypoints: &RoomKeypoints| {
-            let mut frames = keypoints.map.frames[rows.clone()].iter();
-            frames.any(|frame| !frame.is_empty())
-        };
-        let is_there =
-            added_keypoints.is_none() || base.keypoints.as_ref().is_some_and(has_keypoints);
+        let is_there = added_keypoints
+            .is_none_or(|added| has_keypoints(base.keypoints.as_ref(), rows.clone(), added));
         let keypoints = if is_there {
             base.keypoints.clone()
         } else {
@@ -247,9 +243,19 @@ fn joined_keypoints(
     let frames = &mut Arc::make_mut(&mut joined.map).frames;
     frames.resize(frame_count, MappedKeypoints::default());
     for (row, frame) in rows.zip(added_frames) {
-        frames[row] = frame;
+        if frames[row].is_empty() {
+            frames[row] = frame;
+        }
     }
     Ok(Some(joined))
+}
+
+/// Whether the frames in `rows` have keypoints wherever the added ones have.
+fn has_keypoints(known: Option<&RoomKeypoints>, rows: Range<usize>, added: &RoomKeypoints) -> bool {
+    let mut pairs = rows.zip(&added.map.frames);
+    pairs.all(|(row, frame)| {
+        frame.is_empty() || known.is_some_and(|known| !known.map.frames[row].is_empty())
+    })
 }
 
 /// Added keypoints that belong to a feature set of the room.

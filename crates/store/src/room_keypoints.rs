@@ -200,8 +200,12 @@ pub fn read_keypoints(
     columns.check(frame_count).map_err(damaged)?;
 
     let mean = Array1::from_iter(tensors.f32("basis.mean")?.iter().copied());
-    let basis = DescriptorBasis::from_parts(mean, tensors.f32("basis.axes")?)
-        .ok_or_else(|| damaged("has a descriptor basis of a wrong shape".to_owned()))?;
+    let basis = DescriptorBasis::from_parts(mean, tensors.f32("basis.axes")?).ok_or_else(|| {
+        damaged(
+            "has a descriptor basis of a wrong shape, of over 1024 numbers, or not finite"
+                .to_owned(),
+        )
+    })?;
 
     let map = KeypointMap {
         camera: header.camera,

@@ -16,9 +16,6 @@ use crate::matched_views::{
 use crate::tracking::PoseWithCovariance;
 use seese3_core::geometry::{CameraIntrinsics, Pose};
 
-/// Maximum log ratio at which two focal lengths count as equal.
-const SAME_LOG_FOCAL: f64 = 0.02;
-
 /// A mapped room in which views are located by their keypoints.
 #[derive(Debug, Clone)]
 pub struct KeypointRoom {
@@ -257,16 +254,12 @@ impl KeypointRoom {
     }
 
     /// Compares the stated focal length of a view with the one that fits its matches best.
-    ///
-    /// The fitted focal length varies with errors of the map, most of all far from the mapped frames.
-    /// The gate is therefore wider for the focal length of the mapping camera.
     fn contradicted(&self, matched: &MatchedView, camera: &CameraIntrinsics) -> Option<NotLocated> {
         let MatchingParameters {
             confident_inliers,
             min_inliers,
             min_log_focal,
-            mapping_focal_gate,
-            other_focal_gate,
+            min_focal_deviations,
             ..
         } = self.parameters;
         let fit = matched.focal?;
@@ -278,23 +271,12 @@ impl KeypointRoom {
             min_inliers
         };
         let log_factor = fit.factor.ln().abs();
-        if log_factor < min_log_focal || fit.inliers < enough {
-            return None;
-        }
+        let deviations = log_factor / fit.independent_variance.sqrt();
+        let is_contradicted = fit.inliers >= enough
+            && log_factor >= min_log_focal
+            && deviations >= min_focal_deviations;
 
         let stated = camera.focal().x;
-        let is_of_map = (stated / self.map.camera.focal().x).ln().abs() < SAME_LOG_FOCAL;
-        let gate = if is_of_map {
-            mapping_focal_gate
-        } else {
-            other_focal_gate
-        };
-
-        let variance = fit.independent_variance * matched.information.factor(&self.map.noise);
-        let deviations = log_factor / variance.sqrt();
-        let ratio = fit.matches as f64 / matched.matches.len() as f64;
-        let is_contradicted = deviations > gate.max_deviations || ratio > gate.max_match_ratio;
-
         is_contradicted.then_some(NotLocated::CameraContradicted {
             stated,
             fitted: stated * fit.factor,

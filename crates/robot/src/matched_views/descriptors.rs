@@ -8,6 +8,9 @@ use seese3_core::keypoints::Keypoints;
 /// Number of components of a compressed descriptor; one byte each.
 pub const COMPRESSED: usize = 32;
 
+/// Maximum number of components of a descriptor before compression.
+pub const MAX_WIDTH: usize = 1024;
+
 /// Factor between a compressed descriptor of unit length and its 8-bit numbers.
 const SCALE: f32 = 200.0;
 /// Number of descriptors from which the principal components are computed.
@@ -59,10 +62,11 @@ impl DescriptorBasis {
     }
 
     /// A basis from its numbers: `mean` of shape (d), `axes` of shape (d, [`COMPRESSED`]); `None`
-    /// for other shapes or numbers that are not finite.
+    /// for other shapes, more than [`MAX_WIDTH`] numbers or numbers that are not finite.
     pub fn from_parts(mean: Array1<f32>, axes: Array2<f32>) -> Option<Self> {
         let is_finite = mean.iter().chain(&axes).all(|value| value.is_finite());
-        (axes.dim() == (mean.len(), COMPRESSED) && !mean.is_empty() && is_finite)
+        let is_of_shape = axes.dim() == (mean.len(), COMPRESSED);
+        (is_of_shape && (1..=MAX_WIDTH).contains(&mean.len()) && is_finite)
             .then_some(Self { mean, axes })
     }
 

@@ -18,12 +18,12 @@ mod parameters;
 mod triangulation;
 
 pub use absolute_pose::{MapNoise, PoseInformation};
-pub use descriptors::{COMPRESSED, DescriptorBasis};
+pub use descriptors::{COMPRESSED, DescriptorBasis, MAX_WIDTH};
 pub use focal_fit::FocalFit;
 pub use keypoint_map::{KeypointMap, MappedKeypoints, Mapping, epipolar_pairs};
 pub use matching::{Candidates, InlierMatch, MatchedView, ViewKeypoints};
 pub use noise::{Trial, fitted_noise, squared_length, trials};
-pub use parameters::{FocalGate, MappingParameters, MatchingParameters};
+pub use parameters::{MappingParameters, MatchingParameters};
 pub use retrieval::PlaceIndex;
 
 /// Why a keypoint map cannot be computed.

@@ -557,6 +557,21 @@ fn a_wrong_focal_length_of_a_view_is_refused_by_name() {
     }
 }
 
+/// Oracle: the true focal length of the views: images are zoomed, and the camera of the map is stated.
+#[test]
+fn zoomed_images_of_the_mapping_camera_are_refused_by_name() {
+    let world = World::exact();
+    let room = world.room_of(&world.poses, world.measured_map(&world.poses, world.camera));
+    for factor in [0.85, 0.92, 1.09, 1.2] {
+        let zoomed = world.camera.zoomed(factor).unwrap();
+        for pose in new_poses(6) {
+            let view = world.scene.view(&pose, &zoomed, 0.5, &mut Random::new(8));
+            let refused = located(&room, &view.keypoints, &world.camera).unwrap_err();
+            assert!(refused.is_of_camera(), "{factor}: {refused}");
+        }
+    }
+}
+
 /// Oracle: the true focal length. Noise of the keypoints must not make the fitted one longer or
 /// shorter on average.
 #[test]

@@ -29,6 +29,8 @@ use seese3_store::{Kind, OtherFeatures, Published, ResourceName, RoomContents, R
 const SILENCE: Duration = Duration::from_secs(30);
 /// A pose on the wire: 16 numbers of 8 bytes.
 const POSE_BYTES: usize = 128;
+/// Size of the keypoints of a stored frame in memory, bytes: 300 of 48.
+const KEYPOINT_BYTES: usize = 14_400;
 
 /// Receives the next message of an upload.
 ///
@@ -106,7 +108,8 @@ impl Handlers {
                 .newest_room_summary(&received.name.name)
                 .await?;
             let columns: usize = known.features.iter().map(|source| source.dim).sum();
-            let bytes = known.frame_count * (POSE_BYTES + 4 * columns);
+            let keypoints = known.keypoints.map_or(0, |_| KEYPOINT_BYTES);
+            let bytes = known.frame_count * (POSE_BYTES + 4 * columns + keypoints);
             received.memory.push(changes.upload_memory(2 * bytes)?);
         }
 

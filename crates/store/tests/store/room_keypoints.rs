@@ -276,11 +276,17 @@ async fn begun_with_260(known: Option<&RoomKeypoints>) -> (tempfile::TempDir, St
     (folder, store)
 }
 
+fn with_basis_of(known: &RoomKeypoints, mut added: RoomKeypoints) -> RoomKeypoints {
+    Arc::make_mut(&mut added.map).basis = known.map.basis.clone();
+    added
+}
+
 /// Oracle: the definition: the frames of both, each with its own keypoints. Both maps have the same
 /// basis, so that no descriptor changes.
 #[tokio::test]
 async fn added_frames_bring_their_keypoints() {
-    let [known, added] = [keypoints(260, 5), keypoints(40, 7)];
+    let known = keypoints(260, 5);
+    let added = with_basis_of(&known, keypoints(40, 7));
     for begins_with_keypoints in [true, false] {
         let known = begins_with_keypoints.then_some(&known);
         let (_folder, store) = begun_with_260(known).await;
@@ -315,25 +321,37 @@ async fn added_frames_bring_their_keypoints() {
 /// Oracle: the definition: frames that were added without keypoints get those that are sent later.
 #[tokio::test]
 async fn known_frames_without_keypoints_get_those_that_are_sent_again() {
-    let (_folder, store) = begun_with_260(Some(&keypoints(260, 5))).await;
-    let (frames, features) = (part(260..300), [features("f", 260..300)]);
+    let known = keypoints(260, 5);
+    let (_folder, store) = begun_with_260(Some(&known)).await;
+    let features_of = |rows: std::ops::Range<usize>| features("f", rows);
+    let (frames, features) = (part(260..300), [features_of(260..300)]);
     let others = OtherFeatures::Required;
     let without = RoomContents::of(&frames, &features);
     store.extend_room(without, others).await.unwrap();
 
-    let added = keypoints(40, 7);
+    // First those of some of the frames, then those of all, which are then sent once more.
+    let [some, added] =
+        [keypoints(10, 6), keypoints(40, 7)].map(|added| with_basis_of(&known, added));
+    let (ten, ten_features) = (part(260..270), [features_of(260..270)]);
+    let contents = RoomContents {
+        keypoints: Some(&some),
+        ..RoomContents::of(&ten, &ten_features)
+    };
+    assert!(store.extend_room(contents, others).await.unwrap().is_new);
     let with = RoomContents {
         keypoints: Some(&added),
         ..without
     };
-    for (revision, is_new) in [(3, true), (3, false)] {
+    for (revision, is_new) in [(4, true), (4, false)] {
         let published = store.extend_room(with, others).await.unwrap();
         assert_eq!((published.revision, published.is_new), (revision, is_new));
     }
     let room = store.load_room("a", None).await.unwrap();
     assert_eq!(room.room.frame_count(), 300);
     let joined = room.keypoints.unwrap().map;
-    for (found, sent) in joined.frames[260..].iter().zip(&added.map.frames) {
+    let sent = some.map.frames.iter().chain(&added.map.frames[10..]);
+    for (found, sent) in joined.frames[260..].iter().zip(sent) {
+        // Every fifth frame has no keypoints.
         assert_eq!(found.descriptors, sent.descriptors);
     }
 }
