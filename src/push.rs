@@ -90,7 +90,7 @@ impl Push {
             target.clone().at(revision.revision)
         ));
 
-        if self.extend && has_keypoints {
+        if self.extend && created && has_keypoints {
             say(
                 "the covariances of matched views are still those of the map before: encode and push the whole room to \
                  measure them again",

@@ -58,8 +58,7 @@ fn keypoints_are_pushed_with_their_room() {
     let push = format!("push rooms/a --store source --server {}", server.address);
     here.prints(&push, &["rooms/a/revisions/1: published"]);
     here.prints(&push, &["rooms/a/revisions/1: already there, unchanged"]);
-    let words = ["the keypoints stay behind", "already has these frames"];
-    here.prints(&format!("{push} --extend"), &words);
+    here.prints(&format!("{push} --extend"), &["already has these frames"]);
 
     let [sent, arrived] = ["source", "store"].map(|store| loaded(&here, store).keypoints.unwrap());
     assert_eq!(arrived.map.frames, sent.map.frames);
