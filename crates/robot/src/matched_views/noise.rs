@@ -174,7 +174,7 @@ impl Recording<'_> {
 }
 
 /// The noise under which the errors of the trials are most probable, scaled so that the 95 %
-/// ellipsoids hold the share [`HELD`] of them; `None` if there are too few trials.
+/// ellipsoids hold 93 % of them; `None` if there are too few trials.
 pub fn fitted_noise(trials: &[Trial]) -> Option<MapNoise> {
     if trials.len() < MIN_TRIALS {
         return None;
