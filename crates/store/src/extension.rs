@@ -232,6 +232,7 @@ fn joined_keypoints(
                         .to_owned(),
                 );
             }
+
             let map = Arc::make_mut(&mut known.map);
             let count = map.frames.len();
             map.append(&added.map).map_err(|error| error.to_string())?;
@@ -240,6 +241,7 @@ fn joined_keypoints(
         }
     };
 
+    // Known frames keep their keypoints.
     let frames = &mut Arc::make_mut(&mut joined.map).frames;
     frames.resize(frame_count, MappedKeypoints::default());
     for (row, frame) in rows.zip(added_frames) {
@@ -247,6 +249,7 @@ fn joined_keypoints(
             frames[row] = frame;
         }
     }
+
     Ok(Some(joined))
 }
 

@@ -23,7 +23,7 @@ const LARGEST_HOLE: f64 = 0.6;
 /// The golden ratio: its multiples are evenly spaced modulo 1.
 const GOLDEN: f64 = 1.618_033_988_75;
 /// Share of the trials whose errors the 95 % ellipsoids hold. The errors have heavier tails than a
-/// Gaussian: with 0.95, the 68 % ellipsoids would hold up to 93 % of the errors in a mapped part.
+/// Gaussian: with 0.95, the 68 % ellipsoids would be too large.
 const HELD: f64 = 0.93;
 /// The 95 % quantile of χ² with six degrees of freedom.
 const CHI_SQUARED_95: f64 = 12.591_587;
@@ -96,6 +96,7 @@ pub fn trials(map: &KeypointMap, mapping: &Mapping<'_>) -> Vec<Trial> {
         poses: &poses,
         places: &places,
     };
+
     let least = recording.smallest_hole();
     let found: Vec<Option<Trial>> = Hole::all(poses.len(), least)
         .map(|hole| recording.trial(hole))
@@ -155,6 +156,7 @@ impl Recording<'_> {
         for &row in &similar {
             map.frames[row] = self.mapping.map_frame(row, &is_used);
         }
+
         let found = map.match_view(
             ViewKeypoints {
                 keypoints: view.keypoints,
@@ -165,6 +167,7 @@ impl Recording<'_> {
             &parameters,
         )?;
 
+        // Without an information matrix that can be inverted, an error has no likelihood.
         let is_determined = Cholesky::new(found.information.independent).is_some();
         (is_determined && found.is_supported(&parameters)).then(|| Trial {
             error: log(&found.pose.inv_mul(&view.pose)).to_vector(),
@@ -208,12 +211,14 @@ pub fn fitted_noise(trials: &[Trial]) -> Option<MapNoise> {
         }
     }
 
+    // Scale the noise by the tail of the trials' errors.
     let noise = noise_at(at);
     let squared: Vec<f64> = trials
         .iter()
         .map(|trial| squared_length(trial, &noise).unwrap_or(f64::INFINITY))
         .collect();
     let factor = quantile(&squared, HELD)? / CHI_SQUARED_95;
+
     Some(if factor.is_finite() && factor > 0.0 {
         noise.scaled(factor)
     } else {
