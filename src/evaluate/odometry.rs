@@ -15,7 +15,7 @@ use seese3_lab::experiments::odometry::{
 };
 use seese3_lab::report::{
     APE_FORMULA, coverage_table, odometry_json, odometry_table, other_rooms_text,
-    relocalisation_text,
+    relocalisation_text, scenarios_text,
 };
 use seese3_robot::pose_filter::FilterParameters;
 use seese3_robot::tracking::{Replay, TrackerSettings};
@@ -203,6 +203,9 @@ impl Odometry {
         say(shown);
         say(format_args!("\ncovariances:\n{}", coverage_table(tracked)));
 
+        if let Some(text) = scenarios_text(tracked) {
+            say(format_args!("\n{text}\n"));
+        }
         if tracked.len() > 1 {
             say(other_rooms_text(tracked));
         }

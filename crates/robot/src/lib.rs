@@ -38,9 +38,11 @@
 //! | module | purpose |
 //! | --- | --- |
 //! | [`matched_views`] | estimates a view's pose from keypoints matched with mapped keypoints |
+//! | [`visual_odometry`] | estimates a camera's motion from its images, without a map |
 //! | [`tracking`] | tracks a camera frame by frame, with covariances |
 //! | [`pose_filter`] | tracks a camera by located views, without an adapter |
 //! | [`localization`] | estimates where a view is in a mapped room, by the best method that answers |
+//! | [`front_end`] | locates the images of a stream and measures the motion between them |
 //! | [`planning`] | plans a route from a view to a goal, over a room's frames |
 //! | [`calibration`] | measures an adapter's errors in rooms that it was not trained on |
 //! | [`fitting`] | fits an adapter to one mapped room and localizes single views in it |
@@ -50,9 +52,11 @@
 //! clock or the environment. Random numbers come from explicit seeds.
 
 pub mod matched_views;
+pub mod visual_odometry;
 pub mod tracking;
 pub mod pose_filter;
 pub mod localization;
+pub mod front_end;
 pub mod two_view;
 pub mod calibration;
 pub mod planning;

@@ -12,17 +12,18 @@ use seese3_core::keypoints::Keypoints;
 use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::HoldOut;
 use seese3_core::trajectory::Trajectory;
-use seese3_robot::localization::{FocalSearch, KeypointRoom, LocatedView, NotLocated};
-use seese3_robot::matched_views::ViewKeypoints;
-use seese3_robot::pose_filter::{FilterParameters, FilterRoom, PoseFilter, ViewObservation};
-use seese3_robot::tracking::{
-    InitialPose, MatchedPose, PoseWithCovariance, Replay, Status, joined, period_ns,
-};
+use seese3_robot::front_end::{FrontEnd, StreamCamera};
+use seese3_robot::localization::KeypointRoom;
+use seese3_robot::pose_filter::{FilterParameters, FilterRoom, PoseFilter};
+use seese3_robot::tracking::{InitialPose, PoseWithCovariance, Replay, Status, joined, period_ns};
+use seese3_robot::visual_odometry::OdometryParameters;
 
+use super::keypoint_player::{PlayedView, Player, Sight};
 use super::matched_localization::{Baselines, PosedRecording, mapped_room};
 use super::odometry::{
     LostFrames, OTHER_ROOM_FRAMES, PERIOD_NS, RoomOdometry, RoomReplays, room_odometry,
 };
+use super::odometry_scenarios::Scenarios;
 use super::robustness::{Disturbance, DisturbedTracking, PlannedFrame, plan, scored};
 use super::{Error, Within, check_hold_out};
 
@@ -77,7 +78,17 @@ pub fn evaluate<'a>(
             nearest: &|frame| baselines.poses_of(frame.row()).0,
         };
 
-        let found = room_odometry(&replays)?;
+        let camera = room.recording.camera;
+        let streams: Vec<_> = room
+            .streams()
+            .into_iter()
+            .map(|stream| stream.views)
+            .collect();
+        let scenarios = Scenarios::of(&streams, &|first| room.player(first, Some(camera)));
+        let found = RoomOdometry {
+            scenarios: Some(scenarios),
+            ..room_odometry(&replays)?
+        };
         done(&found, &given);
         Ok(found)
     };
@@ -112,17 +123,29 @@ impl<'a> TrackedRoom<'a> {
 
     /// Replays the tracked frames, one stream per sequence.
     fn own_replay(&self, initial: InitialPose) -> Replay {
+        let streams = self.streams().into_iter().map(|stream| {
+            let period_ns = stream.period_ns;
+            (self.play(&stream.views, initial), period_ns)
+        });
+        joined(streams)
+    }
+
+    /// The tracked frames, one stream per sequence.
+    fn streams(&self) -> Vec<Stream<'a>> {
         let room = self.recording.room;
         let same_sequence = |a: &FrameId, b: &FrameId| room.timeline().joins(*a, *b);
         let streams = self.tracked.chunk_by(same_sequence).map(|frames| {
             let period_ns = period_ns(room, frames);
-            let frames: Vec<(&KeypointRecording<'_>, FrameId)> = frames
+            let frames: Vec<_> = frames
                 .iter()
-                .map(|frame| (&self.recording, *frame))
+                .map(|frame| (self.recording, *frame))
                 .collect();
-            (self.replay(&frames, period_ns, initial), period_ns)
+            Stream {
+                views: played(&frames, period_ns),
+                period_ns,
+            }
         });
-        joined(streams)
+        streams.collect()
     }
 
     /// Replays frames of every other room, and counts the LOST answers. The last tracked frames of
@@ -139,12 +162,12 @@ impl<'a> TrackedRoom<'a> {
             let mut theirs = HoldOut::Interleaved.tracked(other.recording.room.timeline());
             theirs.truncate(OTHER_ROOM_FRAMES);
             let ours = own.iter().filter(|_| is_after_own);
-            let ours = ours.map(|frame| (&self.recording, *frame));
+            let ours = ours.map(|frame| (self.recording, *frame));
             let count = theirs.len();
-            let theirs = theirs.into_iter().map(|frame| (&other.recording, frame));
+            let theirs = theirs.into_iter().map(|frame| (other.recording, frame));
             let frames: Vec<_> = ours.chain(theirs).collect();
 
-            let replayed = self.replay(&frames, PERIOD_NS, InitialPose::Unknown);
+            let replayed = self.play(&played(&frames, PERIOD_NS), InitialPose::Unknown);
             let updates = &replayed.updates[replayed.updates.len() - count..];
             let lost = updates
                 .iter()
@@ -155,77 +178,22 @@ impl<'a> TrackedRoom<'a> {
         found
     }
 
-    /// Replays frames of this or another recording through the filter of this room.
-    fn replay(
-        &self,
-        frames: &[(&KeypointRecording<'_>, FrameId)],
-        period_ns: i64,
-        initial: InitialPose,
-    ) -> Replay {
-        let mut sequence: u64 = 0;
-        let mut before: Option<FrameId> = None;
-        let played = frames.iter().map(|(recording, frame)| {
-            // Rows left out leave gaps in the numbers; there is none between recordings.
-            let step = before.filter(|before| before.0 < frame.0);
-            sequence += step.map_or(1, |before| u64::from(frame.0 - before.0));
-            before = Some(*frame);
-            PlayedView {
-                time_ns: sequence as i64 * period_ns,
-                sequence,
-                keypoints: &recording.keypoints[frame.row()],
-                camera: Some(recording.camera),
-                // Frames of a recording differ from each other.
-                fingerprint: sequence,
-                truth: recording.room.poses()[frame.row()],
-            }
-        });
-        self.play(&played.collect::<Vec<_>>(), initial)
-    }
-
     /// Replays views through the filter.
     fn play(&self, views: &[PlayedView<'_>], initial: InitialPose) -> Replay {
         let first = views.first().filter(|_| initial == InitialPose::Given);
-        let first = first.map(|view| PoseWithCovariance::known(view.truth, 1e-3, 1e-3));
-        let mut state = self.filter.start(first.as_ref());
+        let camera = views.first().and_then(|view| view.camera);
+        let mut player = self.player(first.map(|view| view.truth), camera);
         let mut replay = Replay {
             truth: Trajectory::default(),
             sequences: Vec::new(),
             updates: Vec::new(),
             beginnings: vec![0],
         };
-
-        let mut predicted: Option<Pose> = None;
-        let mut search = FocalSearch::default();
         for view in views {
-            let camera = view.camera.or_else(|| {
-                let height = self.recording.camera.height();
-                search.camera(view.keypoints, height, std::iter::once(&self.map))
-            });
-            let located = camera.map(|camera| {
-                let matched = ViewKeypoints {
-                    keypoints: view.keypoints,
-                    camera: &camera,
-                };
-                let located = self.map.locate_from(matched, predicted.as_ref());
-                match (view.camera, located) {
-                    (None, Ok(located)) => Ok(search.with_focal_of(&camera, located)),
-                    (None, Err(why)) if why.is_of_camera() => {
-                        search.contradict();
-                        Err(why)
-                    }
-                    (_, located) => located,
-                }
-            });
-            let observation = self.observation(view, located);
-            let Ok(update) = self.filter.observe(&mut state, &observation) else {
+            let Some(update) = player.step(view, Sight::Mapped, None) else {
                 continue;
             };
-            let tracked = update
-                .map_pose
-                .filter(|_| update.status == Status::Tracking);
-            predicted = tracked.map(|tracked| tracked.pose);
-
-            replay.truth.times_ns.push(observation.time_ns);
+            replay.truth.times_ns.push(view.time_ns);
             replay.truth.poses.push(view.truth);
             replay.sequences.push(view.sequence);
             replay.updates.push(update);
@@ -233,45 +201,50 @@ impl<'a> TrackedRoom<'a> {
         replay
     }
 
-    fn observation(
-        &self,
-        view: &PlayedView<'_>,
-        located: Option<Result<LocatedView, NotLocated>>,
-    ) -> ViewObservation {
-        let (novelty, unlocated) = match &located {
-            Some(Ok(found)) => (found.novelty, String::new()),
-            Some(Err(why)) => (why.novelty().unwrap_or(f64::INFINITY), why.to_string()),
-            None => (f64::INFINITY, "the camera is unknown".to_owned()),
-        };
-        let located = located.and_then(Result::ok);
-        ViewObservation {
-            time_ns: view.time_ns,
-            sequence: view.sequence,
-            matched: located.map(|found| MatchedPose {
-                room: 0,
-                pose: found.pose,
-                novelty: found.novelty,
-                best_frame: self.mapped[found.matched.best_frame()],
-            }),
-            novelty,
-            unlocated,
-            fingerprint: (!view.keypoints.is_empty()).then_some(view.fingerprint),
-            measured: None,
+    /// A player of a new stream, which starts at a known pose, `world_from_camera`, if there is one.
+    /// An unknown camera is estimated.
+    fn player<'b>(&'b self, first: Option<Pose>, camera: Option<CameraIntrinsics>) -> Player<'b> {
+        let first = first.map(|pose| PoseWithCovariance::known(pose, 1e-3, 1e-3));
+        let camera = camera.map_or_else(StreamCamera::unknown, StreamCamera::Stated);
+        Player {
+            filter: &self.filter,
+            map: &self.map,
+            mapped: &self.mapped,
+            height: self.recording.camera.height(),
+            state: self.filter.start(first.as_ref()),
+            front_end: FrontEnd::new(camera, Some(OdometryParameters::default())),
+            predicted: None,
         }
     }
 }
 
-/// A view of a stream.
-struct PlayedView<'a> {
-    time_ns: i64,
-    sequence: u64,
-    keypoints: &'a Keypoints,
-    /// `None` if the service has to estimate it.
-    camera: Option<CameraIntrinsics>,
-    /// Equal for identical images.
-    fingerprint: u64,
-    /// `world_from_camera`.
-    truth: Pose,
+/// A stream that is replayed.
+struct Stream<'a> {
+    views: Vec<PlayedView<'a>>,
+    /// Mean frame period, nanoseconds.
+    period_ns: i64,
+}
+
+/// The views of frames of some recordings.
+fn played<'a>(frames: &[(KeypointRecording<'a>, FrameId)], period_ns: i64) -> Vec<PlayedView<'a>> {
+    let mut sequence: u64 = 0;
+    let mut before: Option<FrameId> = None;
+    let view = |(recording, frame): &(KeypointRecording<'a>, FrameId)| {
+        // Rows left out leave gaps in the numbers; there is none between recordings.
+        let step = before.filter(|before| before.0 < frame.0);
+        sequence += step.map_or(1, |before| u64::from(frame.0 - before.0));
+        before = Some(*frame);
+        PlayedView {
+            time_ns: sequence as i64 * period_ns,
+            sequence,
+            keypoints: &recording.keypoints[frame.row()],
+            camera: Some(recording.camera),
+            // Frames of a recording differ from each other.
+            fingerprint: sequence,
+            truth: recording.room.poses()[frame.row()],
+        }
+    };
+    frames.iter().map(view).collect()
 }
 
 /// Views of a disturbed camera, one per tracked frame of a room.

@@ -9,6 +9,7 @@
 //! - [`matched_localization`]: single views in a partly mapped room, by their keypoints.
 //! - [`motion`]: motion between two views, compared with simple baselines.
 //! - [`odometry`]: a tracker on held-out frames.
+//! - [`odometry_scenarios`]: parts without a map, kidnaps and wheels.
 //! - [`planning`]: paths to a goal, compared with simple planners.
 //! - [`robustness`]: a tracker under disturbances of its images.
 //! - [`path_comparison`]: an estimated path compared with a reference.
@@ -21,11 +22,13 @@ pub mod cross_room;
 pub mod folds;
 pub mod formulations;
 pub mod keypoint_odometry;
+mod keypoint_player;
 pub mod layers;
 pub mod localization;
 pub mod matched_localization;
 pub mod motion;
 pub mod odometry;
+pub mod odometry_scenarios;
 pub mod path_comparison;
 mod mapped_room;
 pub mod planning;

@@ -24,6 +24,7 @@ use seese3_robot::tracking::{
     TrackerSettings, relocalize, replay, replay_streams,
 };
 
+use super::odometry_scenarios::Scenarios;
 use super::tracking_scores::TrackingScores;
 use super::{Error, Within, check_hold_out};
 use crate::json;
@@ -92,6 +93,9 @@ pub struct RoomOdometry {
     /// room's own frames.
     #[serde(rename = "foreign")]
     pub other_rooms: [LostFrames; 2],
+    /// Parts without a map, kidnaps and wheels; absent for streams of an adapter.
+    #[serde(flatten)]
+    pub scenarios: Option<Scenarios>,
 }
 
 /// Squared Mahalanobis lengths of map pose errors; in JSON, their coverage.
@@ -470,6 +474,7 @@ pub(super) fn room_odometry(replays: &RoomReplays<'_>) -> Result<RoomOdometry, E
             frames_to_relocalise: unknown.frames_to_relocalise(),
         },
         other_rooms,
+        scenarios: None,
     })
 }
 

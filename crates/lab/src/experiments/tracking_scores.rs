@@ -10,9 +10,9 @@ use seese3_robot::tracking::{PoseWithCovariance, Replay, Status};
 use crate::json;
 
 /// Translation error above which a pose counts as wrong, metres.
-const WRONG_BEYOND_M: f64 = 0.5;
+const WRONG_BEYOND_M: f64 = 0.2;
 /// Rotation error above which a pose counts as wrong, degrees.
-const WRONG_BEYOND_DEG: f64 = 15.0;
+const WRONG_BEYOND_DEG: f64 = 10.0;
 
 /// The scores of one replay, or of several rooms together.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -33,9 +33,76 @@ pub struct TrackingScores {
     pub tracking_wrong: WrongPoses,
     /// Velocity errors, beside those of the zero-velocity baseline.
     pub velocity: VelocityErrors,
+    /// Drift of `odom_from_camera`.
+    #[serde(flatten)]
+    pub drift: Drift,
 }
 
-/// Number of poses with an error above 0.5 m or 15°; in JSON, their fraction.
+/// Drift of a path: the mean error over all its parts of 0.5, 1, 2 and 4 m, per meter of the true
+/// path, as KITTI measures it. NaN for shorter paths.
+///
+/// Source: A. Geiger et al., "Are we ready for autonomous driving?", CVPR 2012.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Drift {
+    /// Of the position, percent.
+    #[serde(rename = "drift_percent")]
+    pub percent: f64,
+    /// Of the rotation, degrees per meter.
+    #[serde(rename = "drift_deg_per_m")]
+    pub deg_per_m: f64,
+}
+
+/// Lengths of the parts over which drift is measured, meters.
+const DRIFT_LENGTHS_M: [f64; 4] = [0.5, 1.0, 2.0, 4.0];
+
+impl Drift {
+    /// Drift of the odometry of a replay; parts do not cross from one stream to the next.
+    fn of(replay: &Replay) -> Self {
+        let truth = &replay.truth.poses;
+        let step = |pair: &[Pose]| PoseError::between(&pair[0], &pair[1]).translation_m;
+        let mut way_m = vec![0.0];
+        for pair in truth.windows(2) {
+            way_m.push(way_m[way_m.len() - 1] + step(pair));
+        }
+
+        let ends = replay.beginnings.iter().skip(1).copied();
+        let ends = ends.chain([truth.len()]);
+        let (mut percent, mut deg_per_m) = (Vec::new(), Vec::new());
+        for (&begin, end) in replay.beginnings.iter().zip(ends) {
+            for start in begin..end {
+                for length_m in DRIFT_LENGTHS_M {
+                    let is_reached = |row: &usize| way_m[*row] - way_m[start] >= length_m;
+                    let Some(row) = (start..end).find(is_reached) else {
+                        continue;
+                    };
+                    let odom = |row: usize| replay.updates[row].odom.pose;
+                    let error = PoseError::between(
+                        &odom(start).inv_mul(&odom(row)),
+                        &truth[start].inv_mul(&truth[row]),
+                    );
+                    let length_m = way_m[row] - way_m[start];
+                    percent.push(100.0 * error.translation_m / length_m);
+                    deg_per_m.push(error.rotation_rad.to_degrees() / length_m);
+                }
+            }
+        }
+        Self {
+            percent: mean(&percent),
+            deg_per_m: mean(&deg_per_m),
+        }
+    }
+
+    /// Means over rooms; rooms with shorter paths are skipped.
+    fn mean<'a>(rooms: impl Iterator<Item = &'a Self> + Clone) -> Self {
+        let known = rooms.filter(|drift| drift.percent.is_finite());
+        Self {
+            percent: mean(&known.clone().map(|drift| drift.percent).collect::<Vec<_>>()),
+            deg_per_m: mean(&known.map(|drift| drift.deg_per_m).collect::<Vec<_>>()),
+        }
+    }
+}
+
+/// Number of poses with an error above 0.2 m or 10°; in JSON, their fraction.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 #[serde(into = "f64")]
 pub struct WrongPoses {
@@ -89,7 +156,8 @@ impl TrackingScores {
                 poses: sum.poses + room.poses,
                 wrong: sum.wrong + room.wrong,
             }),
-            velocity: VelocityErrors::mean(rooms.map(|room| &room.velocity)),
+            velocity: VelocityErrors::mean(rooms.clone().map(|room| &room.velocity)),
+            drift: Drift::mean(rooms.map(|room| &room.drift)),
         }
     }
 
@@ -157,6 +225,7 @@ impl TrackingScores {
             odom_surprises,
             tracking_wrong,
             velocity: VelocityErrors::of(replay, &keep),
+            drift: Drift::of(replay),
         }
     }
 }
@@ -214,7 +283,8 @@ impl VelocityErrors {
     }
 }
 
-fn is_wrong(pose: &Pose, truth: &Pose) -> bool {
+/// Whether a pose is wrong: off by more than 0.2 m or 10°.
+pub fn is_wrong(pose: &Pose, truth: &Pose) -> bool {
     let error = PoseError::between(pose, truth);
     error.translation_m > WRONG_BEYOND_M || error.rotation_rad > WRONG_BEYOND_DEG.to_radians()
 }

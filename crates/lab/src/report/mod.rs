@@ -47,7 +47,7 @@ pub use localization::{
 };
 pub use odometry::{
     OdometryJson, coverage_table, odometry_json, odometry_table, other_rooms_text,
-    relocalisation_text,
+    relocalisation_text, scenarios_text,
 };
 pub use path_errors::{
     APE_FORMULA, PathErrorsJson, RPE_FORMULA, path_errors_json, path_errors_table,

@@ -7,6 +7,7 @@ use super::table::{Table, fixed};
 use crate::experiments::odometry::{
     MapPoseErrors, Relocalisation, RoomOdometry, StatusShares, squared_errors,
 };
+use crate::experiments::odometry_scenarios::Scenarios;
 use crate::experiments::tracking_scores::TrackingScores;
 use crate::json;
 use seese3_core::statistics::{Rate, coverage, mean, median, root_mean_square};
@@ -24,7 +25,7 @@ pub fn odometry_table(rooms: &[RoomOdometry]) -> Table {
     let mean = (rooms.len() > 1).then(|| Line::of("mean", rooms.len().to_string(), rooms));
     let lines: Vec<Line> = each.chain(mean).collect();
 
-    let columns: [Column<Line>; 16] = [
+    let columns: [Column<Line>; 18] = [
         Text("room", |line| line.name.clone()),
         Text("n", |line| line.count.clone()),
         Number("fused m", 3, |line| line.scores.ape.fused),
@@ -47,6 +48,8 @@ pub fn odometry_table(rooms: &[RoomOdometry]) -> Table {
         Number("zero-velocity error m/s", 3, |line| {
             line.scores.velocity.zero_m_s
         }),
+        Number("odom drift %", 1, |line| line.scores.drift.percent),
+        Number("odom drift °/m", 2, |line| line.scores.drift.deg_per_m),
         Number("unknown start: LOST", 3, |line| line.unknown_start_lost),
         Text("relocalized after", |line| line.relocalised_after.clone()),
     ];
@@ -157,6 +160,56 @@ fn motions(rooms: &[RoomOdometry]) -> Vec<MotionSurprise> {
     rooms.iter().flat_map(|room| room.motions.clone()).collect()
 }
 
+fn scenarios(rooms: &[RoomOdometry]) -> Option<Scenarios> {
+    Scenarios::together(rooms.iter().filter_map(|room| room.scenarios.as_ref()))
+}
+
+/// Position errors of parts without a map, kidnaps and wheels, over all rooms; `None` for streams of
+/// an adapter.
+pub fn scenarios_text(rooms: &[RoomOdometry]) -> Option<String> {
+    let Scenarios {
+        gaps,
+        kidnaps,
+        wheels,
+    } = scenarios(rooms)?;
+    let mut table = Table::new(
+        "no view matched for | n | fused m (median) | standing still m | constant velocity m | within 68 % | within 95 %",
+    );
+    for gap in gaps.iter().filter(|gap| !gap.fused.is_empty()) {
+        let errors = [&gap.fused, &gap.standing_still, &gap.constant_velocity];
+        let medians = errors.map(|errors| median(errors));
+        let cells = std::iter::once(gap.fused.len().to_string())
+            .chain(fixed(medians, 3))
+            .chain(fixed(json::covered(&gap.surprises), 3));
+        table.row(format!("{} s", gap.seconds), cells);
+    }
+
+    let wheels = format!(
+        "simulated wheels (2 % length, 1°/m): fused RMSE {:.3} m, wheels alone {:.3} m, TRACKING {:.3}",
+        wheels.fused, wheels.wheels_alone, wheels.tracking
+    );
+    let kidnaps = if kidnaps.n == 0 {
+        "kidnaps: the streams are too short".to_owned()
+    } else {
+        let found = &kidnaps.recovered_after;
+        let after = if found.is_empty() {
+            "never".to_owned()
+        } else {
+            format!("after {:.0} frames (median)", median(found))
+        };
+        format!(
+            "kidnaps: {} by {:.2} m (median); TRACKING at the right place {after} in {} of {}; wrong {} of {} TRACKING frames",
+            kidnaps.n,
+            median(&kidnaps.distances_m),
+            found.len(),
+            kidnaps.n,
+            kidnaps.wrong,
+            kidnaps.tracking,
+        )
+    };
+    Some(format!("{table}\n{kidnaps}\n{wheels}"))
+}
+
 /// Fraction of frames of other rooms reported LOST, as text with Wilson's 95 % interval.
 pub fn other_rooms_text(rooms: &[RoomOdometry]) -> String {
     let line = |place: usize, when: &str| {
@@ -203,6 +256,10 @@ pub struct OdometryJson<'a> {
     rooms: &'a [RoomOdometry],
     #[serde(flatten)]
     all: TrackingScores,
+    #[serde(flatten)]
+    statuses: StatusShares,
+    #[serde(flatten)]
+    scenarios: Option<Scenarios>,
     /// Fractions of map poses inside the 68 % and the 95 % ellipsoid, over all rooms.
     coverage_places: MapPoseErrors,
     coverage_motions: [f64; 2],
@@ -221,6 +278,8 @@ pub fn odometry_json<'a>(
     OdometryJson {
         rooms,
         all: scores_of(rooms),
+        statuses: Line::of("mean", String::new(), rooms).statuses,
+        scenarios: scenarios(rooms),
         coverage_places: map_poses(rooms),
         coverage_motions: json::covered(&squared_errors(&motions(rooms))),
         relocalisation,

@@ -10,10 +10,12 @@
 use std::sync::Arc;
 
 use crate::matched_views::{
-    Candidates, KeypointMap, MappedKeypoints, MatchedView, MatchingParameters, PlaceIndex,
-    ViewKeypoints,
+    Candidates, InlierMatch, KeypointMap, MappedKeypoints, MatchedView, MatchingParameters,
+    PlaceIndex, ViewKeypoints,
 };
 use crate::tracking::PoseWithCovariance;
+use crate::visual_odometry::KnownDepth;
+use nalgebra::Point3;
 use seese3_core::geometry::{CameraIntrinsics, Pose};
 
 /// A mapped room in which views are located by their keypoints.
@@ -48,6 +50,8 @@ pub struct LocatedView {
 pub enum NotLocated {
     #[error("the view has no keypoints: it is blank, blurred or covered")]
     NoKeypoints,
+    #[error("the focal length of the camera is not estimated yet")]
+    UnknownCamera,
     #[error(
         "only {inliers} of {keypoints} keypoints agree with the map; at least {needed} are required"
     )]
@@ -99,6 +103,7 @@ impl NotLocated {
             } if inliers > 0 => Some(needed as f64 / inliers as f64),
             Self::Clustered { novelty, .. } | Self::Uncertain { novelty, .. } => Some(novelty),
             Self::NoKeypoints
+            | Self::UnknownCamera
             | Self::NotInMap { .. }
             | Self::Undetermined { .. }
             | Self::CameraContradicted { .. } => None,
@@ -164,6 +169,23 @@ impl KeypointRoom {
     ) -> Result<LocatedView, NotLocated> {
         let near = predicted.and_then(|predicted| self.locate_near(view, predicted).ok());
         near.map_or_else(|| self.locate(view), Ok)
+    }
+
+    /// The depths of the keypoints of a located view, from the map points that they are matched with.
+    pub fn known_depths(&self, view: &LocatedView) -> Vec<KnownDepth> {
+        let matches = view.matched.matches.iter();
+        let depth = |found: &InlierMatch| {
+            let mapped = &self.map.frames[found.frame];
+            let point = mapped.point(found.mapped, &self.map.camera);
+            let position = self.poses[found.frame] * Point3::from(point);
+            let depth_m = view.pose.pose.inverse_transform_point(&position).z;
+            (depth_m > 0.0).then_some(KnownDepth {
+                keypoint: found.keypoint,
+                depth_m,
+                deviation: f64::from(mapped.deviations[found.mapped]),
+            })
+        };
+        matches.filter_map(depth).collect()
     }
 
     /// The focal length that fits a view's matches best, image widths, and the number of keypoints

@@ -30,7 +30,7 @@ const MIN_DEPTH: f64 = 1e-6;
 
 /// A keypoint of a view and a map point.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Correspondence {
+pub(crate) struct Correspondence {
     /// Place of the keypoint in the view.
     pub keypoint: usize,
     /// The mapped frame of the map point.
@@ -93,7 +93,7 @@ impl MapNoise {
 
 /// Settings of the search. Pixels are those of an image that is [`PIXEL_IMAGE_WIDTH`] pixels wide.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Search {
+pub(crate) struct Search {
     /// Focal length of the view's camera: pixels per unit length on the plane at depth 1.
     pub focal_px: f64,
     /// Largest reprojection error of an inlier, pixels.
@@ -110,7 +110,7 @@ pub(super) struct Search {
 
 /// A refined pose and its support.
 #[derive(Debug, Clone)]
-pub(super) struct Found {
+pub(crate) struct Found {
     /// `world_from_camera`.
     pub pose: Pose,
     /// Indices of the inliers among the correspondences.
@@ -123,7 +123,7 @@ pub(super) struct Found {
 }
 
 /// The pose with the most support; `None` if no sample gives a pose.
-pub(super) fn find_pose(matches: &[Correspondence], search: &Search) -> Option<Found> {
+pub(crate) fn find_pose(matches: &[Correspondence], search: &Search) -> Option<Found> {
     if matches.len() < SAMPLE + 1 {
         return None;
     }

@@ -70,15 +70,16 @@ impl MappedKeypoints {
 
     /// Positions in the camera frame, meters.
     pub(super) fn in_camera(&self, camera: &CameraIntrinsics) -> Vec<Vector3<f64>> {
-        self.points
-            .iter()
-            .zip(&self.inverse_depths)
-            .map(|(point, &inverse_depth)| {
-                let in_widths =
-                    Vector2::new(f64::from(point.x), f64::from(point.y) * camera.height());
-                camera.to_image_plane(in_widths).push(1.0) / f64::from(inverse_depth)
-            })
+        (0..self.len())
+            .map(|place| self.point(place, camera))
             .collect()
+    }
+
+    /// Position of the keypoint at `place` in the camera frame, meters.
+    pub fn point(&self, place: usize, camera: &CameraIntrinsics) -> Vector3<f64> {
+        let point = self.points[place];
+        let in_widths = Vector2::new(f64::from(point.x), f64::from(point.y) * camera.height());
+        camera.to_image_plane(in_widths).push(1.0) / f64::from(self.inverse_depths[place])
     }
 }
 

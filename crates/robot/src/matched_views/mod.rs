@@ -17,6 +17,7 @@ mod p3p;
 mod parameters;
 mod triangulation;
 
+pub(crate) use absolute_pose::{Correspondence, Search, find_pose};
 pub use absolute_pose::{MapNoise, PoseInformation};
 pub use descriptors::{COMPRESSED, DescriptorBasis, MAX_WIDTH};
 pub use focal_fit::FocalFit;
@@ -25,6 +26,7 @@ pub use matching::{Candidates, InlierMatch, MatchedView, ViewKeypoints};
 pub use noise::{Trial, fitted_noise, squared_length, trials};
 pub use parameters::{MappingParameters, MatchingParameters};
 pub use retrieval::PlaceIndex;
+pub(crate) use triangulation::{pixel_focal, plane_points};
 
 /// Why a keypoint map cannot be computed.
 #[derive(Debug, thiserror::Error, Clone, PartialEq)]

@@ -45,7 +45,7 @@ impl<'a> PosedKeypoints<'a> {
 }
 
 /// Undistorted positions of the first `count` keypoints on the plane at depth 1.
-pub(super) fn plane_points(
+pub(crate) fn plane_points(
     keypoints: &Keypoints,
     camera: &CameraIntrinsics,
     count: usize,
@@ -60,7 +60,7 @@ pub(super) fn plane_points(
 }
 
 /// Pixels per unit length on the plane at depth 1.
-pub(super) fn pixel_focal(camera: &CameraIntrinsics) -> f64 {
+pub(crate) fn pixel_focal(camera: &CameraIntrinsics) -> f64 {
     camera.focal().mean() * PIXEL_IMAGE_WIDTH
 }
 

@@ -2,44 +2,47 @@
 
 use nalgebra::{Cholesky, Matrix6, SMatrix, SVector, Vector6};
 
-use super::FilterParameters;
+use super::{FilterParameters, MotionNoise};
 use crate::tracking::{Drift, MotionPrior, PoseWithCovariance};
+use crate::visual_odometry::VisualMotion;
 use seese3_core::geometry::{Pose, Twist, adjoint, exp, left_jacobian_inverse, log};
 
-const STATE: usize = 23;
-const JOINT: usize = 29;
-/// Number of wheel errors.
-const WHEEL_ERRORS: usize = 5;
+const STATE: usize = 24;
+const JOINT: usize = 30;
+/// Number of lasting errors of motions.
+const MOTION_ERRORS: usize = 6;
+/// Places of the scale of translations of wheel odometry, of its rotations, of its rotations per
+/// meter, and of the scale of visual odometry.
+const WHEEL_SCALE: usize = 0;
+const WHEEL_TURN: usize = 1;
+const WHEEL_CURVE: usize = 2;
+const VISUAL_SCALE: usize = 5;
 type StateMatrix = SMatrix<f64, STATE, STATE>;
 type JointMatrix = SMatrix<f64, JOINT, JOINT>;
 type Observed = SMatrix<f64, 6, JOINT>;
 
-/// Independent noise of a motion by wheel odometry: standard deviations per axis at rest, and over 1 m.
-const DRIVEN_FLOOR_M: f64 = 5e-4;
-const DRIVEN_FLOOR_RAD: f64 = 5e-4;
-const DRIVEN_NOISE_M: f64 = 1e-2;
-const DRIVEN_NOISE_RAD: f64 = 5e-3;
+/// Factor on the process noise of a prior that tells nothing.
+const UNINFORMATIVE: f64 = 1e4;
 
 /// Rows of the blocks of the state.
 const POSE: usize = 0;
 const VELOCITY: usize = 6;
 const CORRELATED: usize = 12;
-const WHEELS: usize = 18;
+const MOTIONS: usize = 18;
 
 /// Rows of the blocks of [`Step`].
 const START: usize = 0;
 const MOTION: usize = 6;
 const END_VELOCITY: usize = 12;
 const END_CORRELATED: usize = 18;
-const END_WHEELS: usize = 24;
+const END_MOTIONS: usize = 24;
 
-/// Pose, velocity, and the correlated errors of located poses and of wheel odometry, with the covariance
-/// of the errors of all four.
+/// Pose, velocity, and the lasting errors of located poses and of measured motions, with the
+/// covariance of the errors of all four.
 ///
 /// The pose error δ is in the body frame, true = pose · exp(δ), ordered (v, ω), in meters and
 /// radians.
 #[derive(Debug, Clone, Copy, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Belief {
     /// `parent_from_camera`.
     pub pose: Pose,
@@ -48,13 +51,10 @@ pub struct Belief {
     /// Lasting error of located poses, in standard deviations of each pose.
     pub correlated_error: Vector6<f64>,
     /// Errors of wheel odometry, in standard deviations of its drift: scale of the translations, scale
-    /// of the rotations, and rotation about each axis per meter.
-    pub wheels: SVector<f64, WHEEL_ERRORS>,
-    /// Of (pose, velocity, correlated error, wheel error); symmetric and positive definite.
-    #[cfg_attr(
-        feature = "serde",
-        serde(with = "seese3_core::matrices::upper_triangle")
-    )]
+    /// of the rotations, and rotation about each axis per meter. Then the error of the scale of visual
+    /// odometry, in its standard deviations.
+    pub motion_errors: SVector<f64, MOTION_ERRORS>,
+    /// Of (pose, velocity, correlated error, motion errors); symmetric and positive definite.
     pub covariance: StateMatrix,
 }
 
@@ -65,7 +65,8 @@ pub fn origin() -> PoseWithCovariance {
 
 /// The belief over one step of time, while observations are added.
 ///
-/// The error state is (initial pose, motion, final velocity, final correlated error, wheel error). The
+/// The error state is (initial pose, motion, final velocity, final correlated error, motion
+/// errors). The
 /// motion's error is in the final body frame.
 pub struct Step {
     /// The initial pose.
@@ -74,7 +75,7 @@ pub struct Step {
     motion: Pose,
     velocity: Vector6<f64>,
     correlated_error: Vector6<f64>,
-    wheels: SVector<f64, WHEEL_ERRORS>,
+    motion_errors: SVector<f64, MOTION_ERRORS>,
     covariance: JointMatrix,
 }
 
@@ -104,14 +105,14 @@ impl Belief {
         block(VELOCITY, VELOCITY, &prior.velocity_covariance());
         block(CORRELATED, CORRELATED, &Matrix6::identity());
         covariance
-            .fixed_view_mut::<WHEEL_ERRORS, WHEEL_ERRORS>(WHEELS, WHEELS)
+            .fixed_view_mut::<MOTION_ERRORS, MOTION_ERRORS>(MOTIONS, MOTIONS)
             .fill_with_identity();
 
         Self {
             pose: place.pose,
             velocity: Twist::default(),
             correlated_error: Vector6::zeros(),
-            wheels: SVector::zeros(),
+            motion_errors: SVector::zeros(),
             covariance,
         }
     }
@@ -129,11 +130,51 @@ impl Belief {
         }
     }
 
+    /// The state with another velocity, independent of all other errors.
+    #[must_use]
+    pub fn with_velocity(mut self, velocity: Twist, covariance: &Matrix6<f64>) -> Self {
+        self.velocity = velocity;
+        self.covariance.fixed_rows_mut::<6>(VELOCITY).fill(0.0);
+        self.covariance.fixed_columns_mut::<6>(VELOCITY).fill(0.0);
+        self.covariance
+            .fixed_view_mut::<6, 6>(VELOCITY, VELOCITY)
+            .copy_from(covariance);
+        self
+    }
+
+    /// Covariance of the velocity.
+    pub fn velocity_covariance(&self) -> Matrix6<f64> {
+        self.covariance
+            .fixed_view::<6, 6>(VELOCITY, VELOCITY)
+            .into_owned()
+    }
+
     /// Predicts the state some seconds later.
     ///
     /// The velocity is the Ornstein–Uhlenbeck process of `prior`, the correlated error one with the
     /// correlation time of the parameters.
     pub fn step(&self, prior: &MotionPrior, seconds: f64, parameters: &FilterParameters) -> Step {
+        self.step_with(prior, seconds, parameters, parameters.process_noise_factor)
+    }
+
+    /// As [`Belief::step`], but the prior tells nothing about the motion, which sensors measure: its
+    /// mean of zero would shorten it.
+    pub fn measured_step(
+        &self,
+        prior: &MotionPrior,
+        seconds: f64,
+        parameters: &FilterParameters,
+    ) -> Step {
+        self.step_with(prior, seconds, parameters, UNINFORMATIVE)
+    }
+
+    fn step_with(
+        &self,
+        prior: &MotionPrior,
+        seconds: f64,
+        parameters: &FilterParameters,
+        noise_factor: f64,
+    ) -> Step {
         let drift = prior.over(&self.velocity, seconds);
         let decay = (-seconds / parameters.correlation_time_s).exp();
 
@@ -145,23 +186,31 @@ impl Belief {
             transition[(END_VELOCITY + axis, VELOCITY + axis)] = drift.left[part];
             transition[(END_CORRELATED + axis, CORRELATED + axis)] = decay;
         }
-        for error in 0..WHEEL_ERRORS {
-            transition[(END_WHEELS + error, WHEELS + error)] = 1.0;
+        // The errors of wheels last; the scale of visual odometry changes with the scene.
+        let visual_decay = (-seconds / parameters.visual_scale_time_s).exp();
+        let mut motion_errors = self.motion_errors;
+        motion_errors[VISUAL_SCALE] *= visual_decay;
+        for error in 0..MOTION_ERRORS {
+            let is_visual = error == VISUAL_SCALE;
+            transition[(END_MOTIONS + error, MOTIONS + error)] =
+                if is_visual { visual_decay } else { 1.0 };
         }
 
         let mut covariance = transition * self.covariance * transition.transpose();
         let mut of_drift = covariance.fixed_view_mut::<12, 12>(MOTION, MOTION);
-        of_drift += drift.noise * parameters.process_noise_factor;
-        for axis in END_CORRELATED..END_WHEELS {
+        of_drift += drift.noise * noise_factor;
+        for axis in END_CORRELATED..END_MOTIONS {
             covariance[(axis, axis)] += 1.0 - decay * decay;
         }
+        let visual_scale = END_MOTIONS + VISUAL_SCALE;
+        covariance[(visual_scale, visual_scale)] += 1.0 - visual_decay * visual_decay;
 
         Step {
             start: self.pose,
             motion: exp(&drift.motion),
             velocity: drift.velocity.to_vector(),
             correlated_error: self.correlated_error * decay,
-            wheels: self.wheels,
+            motion_errors,
             covariance,
         }
     }
@@ -200,36 +249,71 @@ impl Step {
     /// The drift is a scale error of translations, a scale error of rotations, and a rotation per meter
     /// forward, as those of a wrong wheel radius, a wrong track width and unequal wheels. The optical
     /// axis points forward.
-    pub fn by_wheels(&self, motion: &Pose, drift: &Drift) -> Observation {
+    pub fn by_wheels(&self, motion: &Pose, drift: &Drift, noise: &MotionNoise) -> Observation {
         let Twist { linear, angular } = log(motion);
-        let distance_m = linear.norm();
-        let mut of_wheels = SMatrix::<f64, 6, WHEEL_ERRORS>::zeros();
-        of_wheels
-            .fixed_view_mut::<3, 1>(0, 0)
+        let mut errors = SMatrix::<f64, 6, MOTION_ERRORS>::zeros();
+        errors
+            .fixed_view_mut::<3, 1>(0, WHEEL_SCALE)
             .copy_from(&(linear * drift.translation_share));
-        of_wheels
-            .fixed_view_mut::<3, 1>(3, 1)
+        errors
+            .fixed_view_mut::<3, 1>(3, WHEEL_TURN)
             .copy_from(&(angular * drift.rotation_share));
-        of_wheels
-            .fixed_view_mut::<3, 3>(3, 2)
-            .fill_diagonal(drift.rotation_share * distance_m * linear.z.signum());
+        errors
+            .fixed_view_mut::<3, 3>(3, WHEEL_CURVE)
+            .fill_diagonal(drift.rotation_share * linear.norm() * linear.z.signum());
+        self.by_motion(motion, &errors, noise)
+    }
 
+    /// The observation of the motion by visual odometry.
+    pub fn by_images(&self, visual: &VisualMotion, parameters: &FilterParameters) -> Observation {
+        let mut errors = SMatrix::<f64, 6, MOTION_ERRORS>::zeros();
+        errors
+            .fixed_view_mut::<3, 1>(0, VISUAL_SCALE)
+            .copy_from(&(log(&visual.motion).linear * visual.scale_deviation));
+        let observed = self.by_motion(&visual.motion, &errors, &parameters.visual_noise);
+        let of_matches = visual.pose_covariance * parameters.visual_design_effect;
+        Observation {
+            noise: observed.noise + of_matches,
+            ..observed
+        }
+    }
+
+    /// The observation of a motion, with the derivatives of its twist by the lasting errors.
+    fn by_motion(
+        &self,
+        motion: &Pose,
+        errors: &SMatrix<f64, 6, MOTION_ERRORS>,
+        noise: &MotionNoise,
+    ) -> Observation {
         let mut derivative = Observed::zeros();
         derivative
             .fixed_view_mut::<6, 6>(0, MOTION)
             .fill_with_identity();
         derivative
-            .fixed_view_mut::<6, WHEEL_ERRORS>(0, END_WHEELS)
-            .copy_from(&of_wheels);
+            .fixed_view_mut::<6, MOTION_ERRORS>(0, END_MOTIONS)
+            .copy_from(errors);
 
-        let v = DRIVEN_FLOOR_M.powi(2) + DRIVEN_NOISE_M.powi(2) * distance_m;
-        let w = DRIVEN_FLOOR_RAD.powi(2) + DRIVEN_NOISE_RAD.powi(2) * distance_m;
-        let noise = Matrix6::from_diagonal(&Vector6::new(v, v, v, w, w, w));
+        let difference = log(&self.motion.inv_mul(motion)).to_vector();
         Observation {
-            residual: log(&self.motion.inv_mul(motion)).to_vector() - of_wheels * self.wheels,
+            residual: difference - errors * self.motion_errors,
             derivative,
-            noise,
+            noise: noise.over(&log(motion)),
         }
+    }
+
+    /// Takes the velocity of another step, independent of the errors of this one.
+    pub fn take_velocity(&mut self, other: &Self) {
+        self.velocity = other.velocity;
+        self.covariance.fixed_rows_mut::<6>(END_VELOCITY).fill(0.0);
+        self.covariance
+            .fixed_columns_mut::<6>(END_VELOCITY)
+            .fill(0.0);
+        let theirs = other
+            .covariance
+            .fixed_view::<6, 6>(END_VELOCITY, END_VELOCITY);
+        self.covariance
+            .fixed_view_mut::<6, 6>(END_VELOCITY, END_VELOCITY)
+            .copy_from(&theirs);
     }
 
     /// Squared Mahalanobis length of the innovation: χ² with six degrees of freedom if all
@@ -257,7 +341,7 @@ impl Step {
         self.motion *= exp(&Twist::from_vector(&part(MOTION)));
         self.velocity += part(END_VELOCITY);
         self.correlated_error += part(END_CORRELATED);
-        self.wheels += change.fixed_rows::<WHEEL_ERRORS>(END_WHEELS);
+        self.motion_errors += change.fixed_rows::<MOTION_ERRORS>(END_MOTIONS);
 
         // Joseph's form: (I − K H) P (I − K H)ᵀ + K R Kᵀ.
         let rest = JointMatrix::identity() - gain * observed.derivative;
@@ -286,8 +370,8 @@ impl Step {
             merged[(VELOCITY + axis, END_VELOCITY + axis)] = 1.0;
             merged[(CORRELATED + axis, END_CORRELATED + axis)] = 1.0;
         }
-        for error in 0..WHEEL_ERRORS {
-            merged[(WHEELS + error, END_WHEELS + error)] = 1.0;
+        for error in 0..MOTION_ERRORS {
+            merged[(MOTIONS + error, END_MOTIONS + error)] = 1.0;
         }
         let covariance = merged * self.covariance * merged.transpose();
 
@@ -295,7 +379,7 @@ impl Step {
             pose: self.start * self.motion,
             velocity: Twist::from_vector(&self.velocity),
             correlated_error: self.correlated_error,
-            wheels: self.wheels,
+            motion_errors: self.motion_errors,
             covariance: (covariance + covariance.transpose()) * 0.5,
         }
     }

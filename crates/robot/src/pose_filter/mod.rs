@@ -12,18 +12,23 @@
 
 mod belief;
 mod state;
+mod saved;
 mod status;
 
 pub use belief::Belief;
+pub use saved::SavedState;
 pub use state::{
-    FilterCandidate, FilterState, KeyframeMark, LastView, OdometryMark, ViewObservation,
+    Disagreement, FilterCandidate, FilterState, KeyframeMark, LastView, OdometryMark,
+    ViewObservation,
 };
 
 use crate::tracking::{
-    MatchedPose, MotionPrior, PoseWithCovariance, Refusal, Status, Update, extent_m,
+    Drift, MatchedPose, MotionPrior, PoseWithCovariance, Refusal, Status, Update, extent_m,
 };
+use crate::visual_odometry::VisualMotion;
 use belief::{Step, twist_covariance};
-use seese3_core::geometry::log;
+use nalgebra::{Matrix6, Vector6};
+use seese3_core::geometry::{Pose, Twist, log};
 use seese3_core::room::{FrameId, Room};
 
 /// Parameters of a filter.
@@ -47,8 +52,26 @@ pub struct FilterParameters {
     /// Maximum time between two such poses, seconds. After a longer gap, an uncertain belief needs
     /// `views_to_agree` poses again.
     pub max_candidate_s: f64,
-    /// Time without a located view after which a stream is DEGRADED, seconds.
+    /// Time without a located view and without visual odometry after which a stream is DEGRADED,
+    /// seconds.
     pub max_unlocated_s: f64,
+    /// Time without a located view after which a stream that visual odometry carries is DEGRADED,
+    /// seconds.
+    pub max_carried_s: f64,
+    /// Independent noise of wheel odometry.
+    pub wheel_noise: MotionNoise,
+    /// Independent noise of visual odometry.
+    pub visual_noise: MotionNoise,
+    /// Factor on the stated covariance of visual odometry, which takes its matches as independent.
+    pub visual_design_effect: f64,
+    /// Correlation time of the error of the scale of visual odometry, seconds.
+    pub visual_scale_time_s: f64,
+    /// Time over which the differences of wheel and visual odometry are summed, and for which a stream
+    /// is DEGRADED after they contradicted each other, seconds.
+    pub disagreement_time_s: f64,
+    /// Largest speed of a measured motion, meters and radians per second. A faster one is a restart of
+    /// the sensor.
+    pub max_speed: [f64; 2],
     /// Number of consecutive identical images after which a stream is DEGRADED.
     pub max_unchanged_frames: u32,
     /// Interval of keyframes, in frames; at least 1.
@@ -62,17 +85,64 @@ impl Default for FilterParameters {
         Self {
             correlated_share: 0.7,
             correlation_time_s: 0.3,
-            process_noise_factor: 8.0,
+            process_noise_factor: 2.0,
             // The 99 % quantile of χ² with six degrees of freedom, and four times that.
             gate: 16.81,
             outlier_gate: 67.24,
             views_to_agree: 2,
             max_candidate_s: 5.0,
             max_unlocated_s: 0.35,
+            max_carried_s: 1.0,
+            wheel_noise: MotionNoise::WHEELS,
+            visual_noise: MotionNoise::IMAGES,
+            visual_design_effect: 20.0,
+            visual_scale_time_s: 10.0,
+            disagreement_time_s: 1.0,
+            max_speed: [10.0, 15.0],
             max_unchanged_frames: 5,
             keyframe_frames: 30,
             fuse: true,
         }
+    }
+}
+
+/// Independent noise of measured motions: standard deviations per axis. Variances grow in proportion
+/// to the distance and the angle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MotionNoise {
+    /// At rest, meters and radians.
+    pub at_rest: [f64; 2],
+    /// Over a distance of 1 m, meters and radians.
+    pub over_meter: [f64; 2],
+    /// Of the rotation, over an angle of 1 rad, radians.
+    pub over_radian: f64,
+}
+
+impl MotionNoise {
+    /// Noise of wheel odometry, besides its drift.
+    pub const WHEELS: Self = Self {
+        at_rest: [5e-4, 5e-4],
+        over_meter: [1e-2, 5e-3],
+        over_radian: 0.0,
+    };
+
+    /// Noise of visual odometry, besides the error of its scale.
+    pub const IMAGES: Self = Self {
+        at_rest: [1e-3, 1e-3],
+        over_meter: [5e-2, 2e-2],
+        over_radian: 5e-2,
+    };
+
+    /// Covariance over a motion, ordered (v, ω).
+    pub fn over(&self, motion: &Twist) -> Matrix6<f64> {
+        let distance_m = motion.linear.norm();
+        let angle_rad = motion.angular.norm();
+        let [rest_m, rest_rad] = self.at_rest.map(|deviation| deviation.powi(2));
+        let [meter_m, meter_rad] = self.over_meter.map(|deviation| deviation.powi(2));
+
+        let v = rest_m + meter_m * distance_m;
+        let w = rest_rad + meter_rad * distance_m + self.over_radian.powi(2) * angle_rad;
+        Matrix6::from_diagonal(&Vector6::new(v, v, v, w, w, w))
     }
 }
 
@@ -100,6 +170,22 @@ impl FilterRoom {
 pub struct PoseFilter {
     rooms: Vec<FilterRoom>,
     parameters: FilterParameters,
+}
+
+/// Measured motions since the last frame.
+#[derive(Default)]
+struct Motions<'a> {
+    /// By wheel odometry, `last_from_this`, with its drift.
+    wheels: Option<(Pose, Drift)>,
+    visual: Option<&'a VisualMotion>,
+    /// Sequence number of the last frame.
+    since: Option<u64>,
+}
+
+/// A located pose, with its squared innovation if there is a belief in its room.
+struct Located<'a> {
+    matched: &'a MatchedPose,
+    squared_innovation: Option<f64>,
 }
 
 /// What a located pose did.
@@ -144,6 +230,16 @@ impl PoseFilter {
         state.is_placed = true;
         state.candidate = None;
         state.located_ns = state.last.map(|last| last.time_ns);
+        state.sight_ns = state.located_ns;
+        state.is_carried = true;
+    }
+
+    /// Checks that a frame with this timestamp and number is newer than the last one.
+    ///
+    /// # Errors
+    /// [`Refusal`] if it is not.
+    pub fn check(&self, state: &FilterState, time_ns: i64, sequence: u64) -> Result<(), Refusal> {
+        state.seconds_to(time_ns, sequence).map(|_| ())
     }
 
     /// Adds a frame to the stream.
@@ -155,20 +251,36 @@ impl PoseFilter {
         state: &mut FilterState,
         frame: &ViewObservation,
     ) -> Result<Update, Refusal> {
-        let seconds = state.seconds_to(frame)?;
+        let seconds = state.seconds_to(frame.time_ns, frame.sequence)?;
         let is_first = state.last.is_none();
+        let last_sequence = state.last.map(|last| last.sequence);
         let wheel_motion = frame.measured.zip(state.wheel_motion_to(frame));
         state.advance(frame);
         state.expire_candidate(frame, self.parameters.max_candidate_s);
 
-        // 1. Predict, by the motion prior of the room, or of the first room while it is unknown.
+        // 1. Predict, by the motion prior of the room, or of the first room while it is unknown, and by
+        // the measured motions.
         let prior = &self.rooms[state.room.unwrap_or(0)].motion_prior;
         let belief = state.belief.unwrap_or_else(|| Belief::at_origin(prior));
-        let mut step = belief.step(prior, seconds, &self.parameters);
-        if let Some((measured, motion)) = wheel_motion {
-            step.update(&step.by_wheels(&motion, &measured.drift), 1.0);
+        let motions = Motions {
+            wheels: wheel_motion.map(|(measured, motion)| (motion, measured.drift)),
+            visual: frame.visual.as_ref().filter(|_| !is_first),
+            since: last_sequence,
+        };
+        let motions = self.consistent(state, motions, seconds, frame.time_ns);
+        let mut step = self.predicted(&belief, prior, seconds, &motions);
+        if let Some((motion, _)) = motions.wheels {
             state.wheel_motion = state.wheel_motion.and(log(&motion));
         }
+        // After a frame without a motion, the camera may be anywhere.
+        state.is_carried &= motions.visual.is_some();
+        if state.is_carried {
+            state.sight_ns = Some(frame.time_ns);
+        }
+
+        // The odometry composes the measured motions: poses in the map do not move it.
+        let motion = step.motion();
+        state.odom = state.odom.composed(&motion);
 
         // 2. Correct. An identical image holds nothing new.
         let is_new = self.parameters.fuse && state.unchanged_frames == 0;
@@ -176,13 +288,17 @@ impl PoseFilter {
         let squared_innovation =
             matched.and_then(|matched| self.squared_innovation(state, &step, &matched));
         let correction = match &matched {
-            Some(matched) => self.correct(state, &mut step, frame, matched, squared_innovation),
+            Some(matched) => {
+                let located = Located {
+                    matched,
+                    squared_innovation,
+                };
+                self.correct(state, &mut step, frame, &motions, &located)
+            }
             None => Correction::Unused,
         };
 
-        // 3. Compose the odometry from the motions of the steps.
-        let motion = step.motion();
-        state.odom = state.odom.composed(&motion);
+        // 3. The belief after the step.
         state.mark_measured(frame);
         let keyframe = state.keyframe_with(frame, &motion, self.parameters.keyframe_frames);
         let replaced = state.belief.filter(|_| correction == Correction::Replaced);
@@ -216,6 +332,88 @@ impl PoseFilter {
         })
     }
 
+    /// The motions, without both if wheel and visual odometry contradict each other: wheels slip, or
+    /// the images are frozen. A motion that is far from the prior, as after a restart of the wheels, is
+    /// left out too.
+    fn consistent<'a>(
+        &self,
+        state: &mut FilterState,
+        motions: Motions<'a>,
+        seconds: f64,
+        time_ns: i64,
+    ) -> Motions<'a> {
+        let parameters = &self.parameters;
+        let is_usual = |motion: &Pose| {
+            let Twist { linear, angular } = log(motion);
+            linear.norm() <= parameters.max_speed[0] * seconds
+                && angular.norm() <= parameters.max_speed[1] * seconds
+        };
+        let wheels = motions.wheels.filter(|(motion, _)| is_usual(motion));
+        let Some(((motion, drift), visual)) = wheels.zip(motions.visual) else {
+            return Motions { wheels, ..motions };
+        };
+
+        let (driven, seen) = (log(&motion), log(&visual.motion));
+        let noise = parameters.wheel_noise.over(&driven) + parameters.visual_noise.over(&seen);
+        let scale = drift.translation_share.hypot(visual.scale_deviation);
+        let lasting_m = scale * driven.linear.norm().max(seen.linear.norm());
+        let lasting_rad = drift.rotation_share * (driven.angular.norm() + driven.linear.norm());
+        let lasting = [
+            lasting_m,
+            lasting_m,
+            lasting_m,
+            lasting_rad,
+            lasting_rad,
+            lasting_rad,
+        ];
+        let variances = noise.diagonal() + Vector6::from(lasting).map(|value| value * value);
+        let difference = driven.to_vector() - seen.to_vector();
+        let kept = (-seconds / parameters.disagreement_time_s).exp();
+        state.disagreement.add(kept, &difference, &variances);
+
+        let is_contradiction = state.disagreement.squared() > parameters.outlier_gate;
+        if is_contradiction {
+            state.contradicted_ns = Some(time_ns);
+            return Motions {
+                since: motions.since,
+                ..Motions::default()
+            };
+        }
+        Motions { wheels, ..motions }
+    }
+
+    /// Predicts a belief some seconds later: by the measured motions or, without any, by the motion
+    /// prior. The prior always smooths the velocity.
+    fn predicted(
+        &self,
+        belief: &Belief,
+        prior: &MotionPrior,
+        seconds: f64,
+        motions: &Motions<'_>,
+    ) -> Step {
+        let mut by_prior = belief.step(prior, seconds, &self.parameters);
+        if motions.wheels.is_none() && motions.visual.is_none() {
+            return by_prior;
+        }
+
+        self.add_motions(&mut by_prior, motions);
+        let mut step = belief.measured_step(prior, seconds, &self.parameters);
+        self.add_motions(&mut step, motions);
+        step.take_velocity(&by_prior);
+        step
+    }
+
+    fn add_motions(&self, step: &mut Step, motions: &Motions<'_>) {
+        if let Some((motion, drift)) = &motions.wheels {
+            let observed = step.by_wheels(motion, drift, &self.parameters.wheel_noise);
+            step.update(&observed, 1.0);
+        }
+        if let Some(visual) = motions.visual {
+            let observed = step.by_images(visual, &self.parameters);
+            step.update(&observed, 1.0);
+        }
+    }
+
     /// Corrects the step by a located pose.
     ///
     /// Without a belief, or if the pose contradicts it, the pose supports a candidate. The same applies
@@ -226,10 +424,11 @@ impl PoseFilter {
         state: &mut FilterState,
         step: &mut Step,
         frame: &ViewObservation,
-        matched: &MatchedPose,
-        squared_innovation: Option<f64>,
+        motions: &Motions<'_>,
+        located: &Located<'_>,
     ) -> Correction {
         let parameters = &self.parameters;
+        let matched = located.matched;
         let earlier = state.candidate.take();
 
         let seconds = |since: i64| frame.time_ns.abs_diff(since) as f64 * 1e-9;
@@ -237,7 +436,8 @@ impl PoseFilter {
             .located_ns
             .is_some_and(|located| seconds(located) <= parameters.max_candidate_s);
         let is_certain = is_recent || step.end().place().tells_a_place();
-        let squared_innovation = squared_innovation
+        let squared_innovation = located
+            .squared_innovation
             .filter(|_| is_certain)
             .unwrap_or(f64::INFINITY);
         if squared_innovation <= parameters.outlier_gate {
@@ -246,11 +446,13 @@ impl PoseFilter {
             let observed = step.located(&matched.pose, parameters);
             step.update(&observed, factor);
             state.located_ns = Some(frame.time_ns);
+            state.sight_ns = Some(frame.time_ns);
+            state.is_carried = true;
             return Correction::Applied;
         }
 
         let (belief, agreeing) = earlier
-            .and_then(|candidate| self.supported(&candidate, frame, matched))
+            .and_then(|candidate| self.supported(&candidate, frame, motions, matched))
             .unwrap_or_else(|| {
                 let prior = &self.rooms[matched.room].motion_prior;
                 let belief = Belief::at(&matched.pose, prior, parameters.correlated_share);
@@ -261,6 +463,8 @@ impl PoseFilter {
             state.room = Some(matched.room);
             state.is_placed = true;
             state.located_ns = Some(frame.time_ns);
+            state.sight_ns = Some(frame.time_ns);
+            state.is_carried = true;
             return Correction::Replaced;
         }
 
@@ -279,6 +483,7 @@ impl PoseFilter {
         &self,
         candidate: &FilterCandidate,
         frame: &ViewObservation,
+        motions: &Motions<'_>,
         matched: &MatchedPose,
     ) -> Option<(Belief, u32)> {
         let parameters = &self.parameters;
@@ -288,7 +493,11 @@ impl PoseFilter {
         }
 
         let prior = &self.rooms[candidate.room].motion_prior;
-        let mut step = candidate.belief.step(prior, seconds, parameters);
+        // The motions are those since the last frame.
+        let is_last = motions.since == Some(candidate.sequence);
+        let none = Motions::default();
+        let motions = if is_last { motions } else { &none };
+        let mut step = self.predicted(&candidate.belief, prior, seconds, motions);
         let observed = step.located(&matched.pose, parameters);
         let agrees = step.squared_innovation(&observed) <= parameters.gate;
         agrees.then(|| {

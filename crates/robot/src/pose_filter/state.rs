@@ -1,12 +1,13 @@
 //! Input and state of a filter.
 
-use nalgebra::Matrix6;
+use nalgebra::{Matrix6, Vector6};
 
 use super::Belief;
 use super::belief::origin;
 use crate::tracking::{
     Candidate, Drift, MatchedPose, MeasuredPose, OdometryDelta, PoseWithCovariance, Refusal,
 };
+use crate::visual_odometry::VisualMotion;
 use seese3_core::geometry::{Pose, log};
 
 /// One frame of a stream.
@@ -24,13 +25,14 @@ pub struct ViewObservation {
     pub unlocated: String,
     /// Hash of the view's keypoints: equal for identical images. `None` without keypoints.
     pub fingerprint: Option<u64>,
+    /// The motion since the last frame by visual odometry, if its images agree.
+    pub visual: Option<VisualMotion>,
     /// Camera pose from wheel odometry, in the odometry frame of that sensor.
     pub measured: Option<MeasuredPose>,
 }
 
 /// Complete state of a stream.
 #[derive(Debug, Clone, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct FilterState {
     /// The only room, or the one in which the camera was located; an index of the filter's rooms.
     pub room: Option<usize>,
@@ -52,8 +54,44 @@ pub struct FilterState {
     pub candidate: Option<FilterCandidate>,
     /// Time of the last frame whose located pose was used, nanoseconds on the sensor's clock.
     pub located_ns: Option<i64>,
+    /// Time of the last frame that was located or that visual odometry tracked, nanoseconds on the
+    /// sensor's clock.
+    pub sight_ns: Option<i64>,
+    /// Whether visual odometry has tracked every frame since the last located one.
+    pub is_carried: bool,
+    /// The difference of wheel and visual odometry.
+    pub disagreement: Disagreement,
+    /// Time of the last frame at which they contradicted each other, nanoseconds on the sensor's clock.
+    pub contradicted_ns: Option<i64>,
     /// Number of consecutive frames with the same image as the one before.
     pub unchanged_frames: u32,
+}
+
+/// Sum of the differences of wheel and visual odometry; older ones count less.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Disagreement {
+    /// Sum of the twists, meters and radians.
+    pub sum: Vector6<f64>,
+    /// Variances of the sum, if both are right.
+    pub variances: Vector6<f64>,
+}
+
+impl Disagreement {
+    /// Adds the difference of one step, after forgetting a share of the earlier ones.
+    pub(super) fn add(&mut self, kept: f64, difference: &Vector6<f64>, variances: &Vector6<f64>) {
+        self.sum = self.sum * kept + difference;
+        self.variances = self.variances * kept * kept + variances;
+    }
+
+    /// Squared length of the sum in standard deviations: χ² with six degrees of freedom if both
+    /// sensors are right.
+    pub(super) fn squared(&self) -> f64 {
+        let pairs = self.sum.iter().zip(&self.variances);
+        pairs
+            .filter(|(_, variance)| **variance > 0.0)
+            .map(|(sum, variance)| sum * sum / variance)
+            .sum()
+    }
 }
 
 /// The last frame of a stream.
@@ -70,7 +108,6 @@ pub struct LastView {
 
 /// The keyframe of reported motions.
 #[derive(Debug, Clone, Copy, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct KeyframeMark {
     /// Sequence number.
     pub sequence: u64,
@@ -80,7 +117,6 @@ pub struct KeyframeMark {
 
 /// The last frame with wheel odometry.
 #[derive(Debug, Clone, Copy, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct OdometryMark {
     /// Camera pose in the sensor's odometry frame.
     pub pose: Pose,
@@ -94,7 +130,6 @@ pub struct OdometryMark {
 
 /// A hypothesis with too few agreeing poses.
 #[derive(Debug, Clone, Copy, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct FilterCandidate {
     /// The room, an index of the filter's rooms.
     pub room: usize,
@@ -122,6 +157,10 @@ impl FilterState {
             keyframe: None,
             candidate: None,
             located_ns: None,
+            sight_ns: None,
+            is_carried: false,
+            disagreement: Disagreement::default(),
+            contradicted_ns: None,
             unchanged_frames: 0,
         }
     }
@@ -130,23 +169,23 @@ impl FilterState {
     ///
     /// # Errors
     /// [`Refusal`] if the frame is not newer.
-    pub(super) fn seconds_to(&self, frame: &ViewObservation) -> Result<f64, Refusal> {
+    pub(super) fn seconds_to(&self, time_ns: i64, sequence: u64) -> Result<f64, Refusal> {
         let Some(last) = self.last else {
             return Ok(0.0);
         };
-        if frame.sequence <= last.sequence {
+        if sequence <= last.sequence {
             return Err(Refusal::Duplicate {
-                sequence: frame.sequence,
+                sequence,
                 last: last.sequence,
             });
         }
-        if frame.time_ns <= last.time_ns {
+        if time_ns <= last.time_ns {
             return Err(Refusal::Late {
-                time_ns: frame.time_ns,
+                time_ns,
                 last_ns: last.time_ns,
             });
         }
-        Ok(frame.time_ns.abs_diff(last.time_ns) as f64 * 1e-9)
+        Ok(time_ns.abs_diff(last.time_ns) as f64 * 1e-9)
     }
 
     /// The motion since the last frame by wheel odometry, `last_from_this`, if both frames have it.
@@ -214,6 +253,7 @@ impl FilterState {
         // A pose set before the first frame counts as located at the first frame.
         if self.is_placed {
             self.located_ns.get_or_insert(frame.time_ns);
+            self.sight_ns.get_or_insert(frame.time_ns);
         }
     }
 

@@ -28,6 +28,8 @@ impl PoseFilter {
                     "the client has set the pose, and it is still certain"
                 } else if frame.unlocated.is_empty() {
                     "recent views are located by their keypoints"
+                } else if frame.visual.is_some() {
+                    "visual odometry carries the pose since the last located view"
                 } else {
                     "a view was located, or the client has set the pose, a moment ago"
                 };
@@ -65,6 +67,15 @@ impl PoseFilter {
                 state.unchanged_frames + 1
             ));
         }
+        let since_s = |earlier: i64| frame.time_ns.abs_diff(earlier) as f64 * 1e-9;
+        let contradicted_s = state.contradicted_ns.map(since_s);
+        if contradicted_s.is_some_and(|seconds| seconds < parameters.disagreement_time_s) {
+            return Some(
+                "wheel odometry and the images contradict each other: wheels slip, or the camera is \
+                 frozen"
+                    .to_owned(),
+            );
+        }
         if let Some(candidate) = &state.candidate {
             let agreement = self.agreement(candidate.agreeing);
             return Some(format!(
@@ -79,9 +90,7 @@ impl PoseFilter {
             ));
         }
 
-        let unlocated_s = state
-            .located_ns
-            .map_or(0.0, |located| frame.time_ns.abs_diff(located) as f64 * 1e-9);
+        let unlocated_s = state.sight_ns.map_or(0.0, since_s);
         (unlocated_s > parameters.max_unlocated_s).then(|| {
             let why = if parameters.fuse {
                 why_unlocated(frame)

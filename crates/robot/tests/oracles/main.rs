@@ -13,3 +13,4 @@ mod matched_views;
 mod multi_step;
 mod pose_filter;
 mod tracking;
+mod visual_odometry;

@@ -1,15 +1,16 @@
 //! The filter of located poses.
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix6, Vector3};
 
 use seese3_core::geometry::{Pose, PoseError, Twist, body_twist, exp};
 use seese3_core::room::FrameId;
 use seese3_robot::pose_filter::{
-    Belief, FilterParameters, FilterRoom, FilterState, PoseFilter, ViewObservation,
+    Belief, FilterParameters, FilterRoom, FilterState, MotionNoise, PoseFilter, ViewObservation,
 };
 use seese3_robot::tracking::{
     Drift, MatchedPose, MeasuredPose, MotionPrior, PoseWithCovariance, Refusal, Status, Update,
 };
+use seese3_robot::visual_odometry::VisualMotion;
 
 const PERIOD_NS: i64 = 33_333_333;
 
@@ -50,6 +51,7 @@ fn view(number: u64, pose: Option<Pose>) -> ViewObservation {
             "too few keypoints".to_owned()
         },
         fingerprint: Some(number),
+        visual: None,
         measured: None,
     }
 }
@@ -129,7 +131,7 @@ fn errors_turn_with_the_camera() {
         rotation_share: 1e-4,
     };
     let mut step = Belief::at(&place, &prior, 0.0).step(&prior, 0.1, &parameters);
-    step.update(&step.by_wheels(&turn, &drift), 1.0);
+    step.update(&step.by_wheels(&turn, &drift, &MotionNoise::WHEELS), 1.0);
     let end = step.end().place();
     assert!((end.covariance[(1, 1)] - 1e-2).abs() < 1e-4, "{end:?}");
     assert!(end.covariance[(0, 0)] < 1e-4);
@@ -202,7 +204,7 @@ fn wheels_carry_the_pose_and_their_errors_are_learned() {
             .observe(&mut state, &wheel_frame(number, true))
             .unwrap();
     }
-    let learned = state.belief.unwrap().wheels;
+    let learned = state.belief.unwrap().motion_errors;
     assert!((learned[0] - 0.8).abs() < 0.3, "{learned}");
     assert!((learned[1] - 1.0).abs() < 0.4, "{learned}");
     for number in 300..=600 {
@@ -221,6 +223,179 @@ fn wheels_carry_the_pose_and_their_errors_are_learned() {
     );
     assert!(error < 0.5 * raw.translation_m, "{error} {raw:?}");
     assert!(pose.squared_error(&truth[600]).unwrap() < 12.6);
+}
+
+/// The motion to a frame by visual odometry, exact.
+fn visual(number: u64) -> VisualMotion {
+    VisualMotion {
+        motion: path(number - 1).inv_mul(&path(number)),
+        pose_covariance: Matrix6::identity() * 1e-6,
+        scale_deviation: 0.03,
+        inliers: 200,
+        is_keyframe: false,
+    }
+}
+
+/// Oracle: the true path. Visual odometry carries the pose where no view is located: the stream is
+/// TRACKING for one second. Without it, or after a frame without a motion, the stream is soon
+/// DEGRADED.
+#[test]
+fn visual_odometry_carries_the_pose() {
+    let filter = filter();
+    for (with_images, lost) in [(true, None), (true, Some(40)), (false, None)] {
+        let mut state = filter.start(None);
+        let mut last = None;
+        for number in 1..=59 {
+            let is_located = number <= 30;
+            let is_moved = with_images && number > 1 && lost != Some(number);
+            let observed = ViewObservation {
+                visual: is_moved.then(|| visual(number)),
+                ..view(number, is_located.then(|| path(number)))
+            };
+            let update = filter.observe(&mut state, &observed).unwrap();
+            if number == 58 && with_images && lost.is_none() {
+                assert_eq!(update.status, Status::Tracking, "{}", update.reason);
+            }
+            last = Some(update);
+        }
+
+        let update = last.unwrap();
+        if with_images && lost.is_none() {
+            assert!(error_m(&update, &path(59)) < 0.02);
+            let odom = path(1).inv_mul(&path(59));
+            assert!(PoseError::between(&update.odom.pose, &odom).translation_m < 0.03);
+            assert!(update.odom.squared_error(&odom).unwrap() < 12.6);
+        } else {
+            assert_eq!(update.status, Status::Degraded, "{}", update.reason);
+        }
+    }
+}
+
+/// Oracle: the contract. A frozen picture with noise shows no motion, in the map and between images;
+/// the wheels know better, so the stream does not stay TRACKING. Wheels that agree change nothing.
+#[test]
+fn wheels_reveal_frozen_images() {
+    let filter = filter();
+    let drift = Drift {
+        translation_share: 0.03,
+        rotation_share: 0.03,
+    };
+    for is_frozen in [false, true] {
+        let mut state = filter.start(None);
+        let mut tracking_wrong = 0;
+        for number in 1..=120 {
+            let seen = if is_frozen { number.min(60) } else { number };
+            let moved = VisualMotion {
+                motion: path(seen.max(2) - 1).inv_mul(&path(seen.max(2))),
+                ..visual(2)
+            };
+            let still = VisualMotion {
+                motion: Pose::identity(),
+                ..visual(2)
+            };
+            let observed = ViewObservation {
+                visual: Some(if seen == number { moved } else { still }),
+                measured: Some(MeasuredPose {
+                    pose: path(number),
+                    drift,
+                }),
+                ..view(number, Some(path(seen)))
+            };
+            let update = filter.observe(&mut state, &observed).unwrap();
+            let is_tracking = update.status == Status::Tracking;
+            assert!(is_frozen || number < 3 || is_tracking, "{}", update.reason);
+            if is_tracking && number > 2 {
+                tracking_wrong += usize::from(error_m(&update, &path(number)) > 0.2);
+            }
+        }
+        assert_eq!(tracking_wrong, 0);
+    }
+}
+
+/// Oracle: the contract: wheels that begin a new odometry frame, 100 m away, do not move the pose.
+#[test]
+fn restarted_wheels_do_not_move_the_pose() {
+    let filter = filter();
+    let drift = Drift {
+        translation_share: 0.03,
+        rotation_share: 0.03,
+    };
+    let mut state = filter.start(None);
+    for number in 1..=60 {
+        let frame = if number > 40 { 100.0 } else { 0.0 };
+        let observed = ViewObservation {
+            measured: Some(MeasuredPose {
+                pose: Pose::translation(frame, 0.0, 0.0) * path(number),
+                drift,
+            }),
+            ..view(number, (number <= 30).then(|| path(number)))
+        };
+        let update = filter.observe(&mut state, &observed).unwrap();
+        if number > 2 {
+            assert!(error_m(&update, &path(number)) < 0.03, "{number}");
+        }
+    }
+}
+
+/// Oracle: the contract of a resumed stream: the map pose is the same to the bit, the covariances are
+/// equal up to single precision, the status goes on, and the odometry begins anew.
+#[test]
+fn a_resumed_stream_goes_on_at_the_same_pose() {
+    let filter = filter();
+    let mut state = filter.start(None);
+    for number in 1..=30 {
+        let observed = ViewObservation {
+            visual: (number > 1).then(|| visual(number)),
+            ..view(number, Some(path(number)))
+        };
+        filter.observe(&mut state, &observed).unwrap();
+    }
+
+    let mut resumed = filter.resumed(&state.saved());
+    let [before, after] = [&state, &resumed].map(|state| state.belief.unwrap());
+    assert_eq!(before.pose, after.pose);
+    assert_eq!(before.velocity, after.velocity);
+    let [a, b] = [before, after].map(|belief| belief.place().covariance);
+    assert!((a - b).norm() < 1e-4 * a.norm());
+    assert!(b.cholesky().is_some());
+
+    let late = filter.observe(&mut resumed, &view(30, Some(path(30))));
+    assert!(matches!(late, Err(Refusal::Duplicate { .. })));
+    let update = filter
+        .observe(&mut resumed, &view(31, Some(path(31))))
+        .unwrap();
+    assert_eq!(update.status, Status::Tracking, "{}", update.reason);
+    assert!(error_m(&update, &path(31)) < 0.01);
+    assert!(update.odom.pose.translation.vector.norm() < 0.02);
+}
+
+/// Oracle: the contract of an odometry frame (REP 105): poses in the map, here of a camera that the
+/// map believes carried away by 1 m, do not move the odometry.
+#[test]
+fn the_map_does_not_move_the_odometry() {
+    let filter = filter();
+    let mut state = filter.start(None);
+    let carried = Pose::translation(1.0, 0.0, 0.0);
+    let mut before: Option<Pose> = None;
+    for number in 1..=60 {
+        let place = if number <= 30 {
+            path(number)
+        } else {
+            carried * path(number)
+        };
+        let observed = ViewObservation {
+            visual: (number > 1).then(|| visual(number)),
+            ..view(number, Some(place))
+        };
+        let update = filter.observe(&mut state, &observed).unwrap();
+        if let Some(before) = before.replace(update.odom.pose) {
+            let step = before.inv_mul(&update.odom.pose);
+            let error = PoseError::between(&step, &visual(number).motion);
+            assert!(error.translation_m < 2e-3, "{number}: {error:?}");
+        }
+    }
+    let update = state.belief.unwrap();
+    assert!(PoseError::between(&update.pose, &(carried * path(60))).translation_m < 0.02);
 }
 
 /// Oracle: the contract: two located views that agree start the tracking, at the true pose, with the

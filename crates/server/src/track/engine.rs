@@ -4,7 +4,9 @@ use serde::{Deserialize, Serialize};
 
 use super::rooms::TrackedRoom;
 use seese3_core::room::FrameId;
-use seese3_robot::pose_filter::{FilterParameters, FilterRoom, FilterState, PoseFilter};
+use seese3_robot::pose_filter::{
+    FilterParameters, FilterRoom, FilterState, PoseFilter, SavedState,
+};
 use seese3_robot::tracking::{PoseWithCovariance, State, Tracker};
 
 /// A tracker with the state of its stream.
@@ -22,7 +24,7 @@ pub enum Engine {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub enum EngineState {
     Adapter(Box<State>),
-    Keypoints(Box<FilterState>),
+    Keypoints(Box<SavedState>),
 }
 
 impl Engine {
@@ -66,11 +68,11 @@ impl Engine {
         }
     }
 
-    /// A copy of the state.
+    /// The part of the state that a token holds.
     pub fn state(&self) -> EngineState {
         match self {
             Self::Adapter { state, .. } => EngineState::Adapter(state.clone()),
-            Self::Keypoints { state, .. } => EngineState::Keypoints(state.clone()),
+            Self::Keypoints { state, .. } => EngineState::Keypoints(Box::new(state.saved())),
         }
     }
 
@@ -83,11 +85,11 @@ impl Engine {
                 *state = resumed;
                 fits
             }
-            (Self::Keypoints { state, .. }, EngineState::Keypoints(resumed)) => {
-                let candidate = resumed.candidate.as_ref().map(|candidate| candidate.room);
-                let mut named = [resumed.room, candidate].into_iter().flatten();
-                let fits = named.all(|room| room < rooms.len());
-                *state = resumed;
+            (Self::Keypoints { filter, state }, EngineState::Keypoints(resumed)) => {
+                let fits = resumed.room.is_none_or(|room| room < rooms.len());
+                if fits {
+                    **state = filter.resumed(&resumed);
+                }
                 fits
             }
             _ => false,
@@ -106,13 +108,7 @@ impl EngineState {
                     candidate.map(|candidate| &mut candidate.room),
                 )
             }
-            Self::Keypoints(state) => {
-                let candidate = state.candidate.as_mut();
-                (
-                    &mut state.room,
-                    candidate.map(|candidate| &mut candidate.room),
-                )
-            }
+            Self::Keypoints(state) => (&mut state.room, None),
         };
         room.iter_mut().chain(candidate)
     }

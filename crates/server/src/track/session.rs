@@ -11,7 +11,7 @@ use super::super::snapshot::Snapshot;
 use super::Overtaken;
 use super::configuration::{StreamFrames, back_pressure, is_fused, parameters, rooms, settings};
 use super::engine::Engine;
-use super::keypoints::{CameraVotes, StreamCamera, StreamMatch, StreamRooms};
+use super::keypoints::{StreamRooms, stream_camera};
 use super::rooms::{TrackedRoom, rooms_with_keypoints};
 use super::sealed::Sealed;
 use super::sensors::Sensors;
@@ -21,11 +21,13 @@ use pb::TrackRefusalReason as Reason;
 use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::Pose;
 use seese3_core::keypoints::{KeypointSource, Keypoints};
+use seese3_robot::front_end::{FrontEnd, ImageReading};
 use seese3_robot::localization::NotLocated;
 use seese3_robot::pose_filter::ViewObservation;
 use seese3_robot::tracking::{
     MeasuredPose, Observation, OtherView, PoseWithCovariance, Refusal, Status, Tracker, Update,
 };
+use seese3_robot::visual_odometry::OdometryParameters;
 
 const FIELD: &str = "config";
 
@@ -40,9 +42,8 @@ pub struct Session {
     config: pb::TrackConfig,
     frames: StreamFrames,
     sensors: Sensors,
-    camera: StreamCamera,
-    camera_votes: CameraVotes,
-    /// The last map pose while TRACKING, `world_from_camera`.
+    front_end: FrontEnd,
+    /// The map pose of the last view, `world_from_camera`, if the view was located while TRACKING.
     last_pose: Option<Pose>,
     /// Whether the last status was LOST.
     is_lost: bool,
@@ -116,7 +117,7 @@ impl Session {
         // Validate everything before the stream starts.
         let frames = StreamFrames::of(&config)?;
         let sensors = Sensors::of(&config, &frames)?;
-        let camera = StreamCamera::of(&config)?;
+        let camera = stream_camera(&config)?;
         back_pressure(config.back_pressure)?;
 
         // The pose is in a room's world frame, so it needs `room`.
@@ -157,6 +158,8 @@ impl Session {
             }
         };
 
+        let is_of_keypoints = matches!(engine, Engine::Keypoints { .. });
+        let odometry = is_of_keypoints.then(OdometryParameters::default);
         Ok(Self {
             encoders: snapshot.without_rooms(),
             rooms,
@@ -164,8 +167,7 @@ impl Session {
             config,
             frames,
             sensors,
-            camera,
-            camera_votes: CameraVotes::default(),
+            front_end: FrontEnd::new(camera, odometry),
             last_pose: None,
             is_lost: false,
             key: key.clone(),
@@ -203,6 +205,7 @@ impl Session {
             frames: Some(self.frames.names.clone()),
             keyframes: Some(keyframes),
             calibration_rooms: calibrated_on as u32,
+            has_visual_odometry: self.front_end.has_odometry(),
         };
 
         self.answer(pb::track_response::Answer::Started(started))
@@ -338,8 +341,7 @@ impl Session {
     /// moved since.
     pub fn reset(&mut self) -> pb::TrackResponse {
         self.engine.reset();
-        self.camera.restart();
-        self.camera_votes = CameraVotes::default();
+        self.front_end.reset();
         self.last_pose = None;
         self.is_lost = false;
         self.answer(pb::track_response::Answer::Acknowledged(
@@ -361,23 +363,19 @@ impl Session {
         self.engine.room().filter(|_| !is_lost)
     }
 
-    /// Matches the keypoints of the stream's own image with its rooms.
-    fn matched(&mut self, image: &ImageKeypoints) -> Result<StreamMatch, Error> {
+    /// Reads the keypoints of the stream's own image.
+    fn read(&mut self, image: &ImageKeypoints, time_ns: i64) -> Result<ImageReading, Error> {
         let Some(source) = self.keypoint_source().cloned() else {
-            return Ok(StreamMatch::default());
+            return Ok(ImageReading::default());
         };
+        let room = self.room_to_match();
         let rooms = StreamRooms {
             rooms: &self.rooms,
             source: &source,
-            room: self.room_to_match(),
+            room,
             predicted: self.last_pose,
         };
-        let found = self.camera.matched("frame.view.image", image, &rooms)?;
-        Ok(if self.camera.is_estimated() {
-            found
-        } else {
-            self.camera_votes.judged(found)
-        })
+        rooms.read(&mut self.front_end, "frame.view.image", image, time_ns)
     }
 
     /// An embedder of images, features and latents for the stream's adapter, which also detects
@@ -435,7 +433,7 @@ impl Session {
 
         let tracked = update
             .map_pose
-            .filter(|_| update.status == Status::Tracking);
+            .filter(|_| update.status == Status::Tracking && update.match_used);
         self.last_pose = tracked.map(|tracked| tracked.pose);
         self.is_lost = update.status == Status::Lost;
         Ok(match contradicted {
@@ -473,8 +471,11 @@ impl Session {
             .and_then(|embedder| embedder.embed("frame.view", view))
             .map_err(refused(Reason::View))?;
         let matched = match keypoints {
-            Some(image) if !is_blank => self.matched(&image).map_err(refused(Reason::View))?,
-            _ => StreamMatch::default(),
+            Some(image) if !is_blank => {
+                let read = self.read(&image, timestamp_ns);
+                read.map_err(refused(Reason::View))?
+            }
+            _ => ImageReading::default(),
         };
         let other_views = self
             .encoded_other_views(other_views)
@@ -490,7 +491,7 @@ impl Session {
             sequence,
             latent,
             feature,
-            matched: matched.pose,
+            matched: matched.matched,
             is_blank,
             measured,
             gravity,
@@ -521,29 +522,18 @@ impl Session {
             return Err(unused(Reason::View, "frame.other_views"));
         }
 
+        // A refused frame must not change what later images are compared with.
+        if let Engine::Keypoints { filter, state } = &self.engine {
+            filter.check(state, frame.timestamp_ns, frame.sequence)?;
+        }
         let measured = self.measured(frame.odometry)?;
         let image = self.detected(frame.view).map_err(refused(Reason::View))?;
-        let matched = self.matched(&image).map_err(refused(Reason::View))?;
-        let why_not = matched.why_not;
-        let novelty = match &matched.pose {
-            Some(pose) => pose.novelty,
-            None => why_not
-                .and_then(|why| why.novelty())
-                .unwrap_or(f64::INFINITY),
-        };
-        let unlocated = match why_not {
-            Some(why) => why.to_string(),
-            None if matched.pose.is_some() => String::new(),
-            None => "the focal length of the camera is not estimated yet".to_owned(),
-        };
+        let read = self
+            .read(&image, frame.timestamp_ns)
+            .map_err(refused(Reason::View))?;
         let observation = ViewObservation {
-            time_ns: frame.timestamp_ns,
-            sequence: frame.sequence,
-            matched: matched.pose,
-            novelty,
-            unlocated,
-            fingerprint: image.fingerprint(),
             measured,
+            ..read.observation(frame.timestamp_ns, frame.sequence, image.fingerprint())
         };
 
         let Engine::Keypoints { filter, state } = &mut self.engine else {
