@@ -129,7 +129,7 @@ impl FrontEnd {
         *self = Self::new(camera, parameters);
     }
 
-    /// The stated camera of the stream.
+    /// The camera of the stream.
     pub fn camera(&self) -> &StreamCamera {
         &self.camera
     }

@@ -7,8 +7,8 @@
 //! - The error of a located pose is the sum of a time-correlated part and white noise; see [`Belief`].
 //!   The filter does not average the correlated part out.
 //! - A located pose that contradicts the belief is not used. Two in a row that agree replace it.
-//! - `odom_from_camera` composes the motions of the steps, in which correlated errors cancel. It is
-//!   continuous and drifts.
+//! - Measured motions (visual odometry, wheels) replace the motion prior, which smooths the velocity.
+//! - `odom_from_camera` composes the motions without the located poses. It is continuous and drifts.
 
 mod belief;
 mod state;
