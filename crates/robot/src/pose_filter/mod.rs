@@ -272,8 +272,8 @@ impl PoseFilter {
         if let Some((motion, _)) = motions.wheels {
             state.wheel_motion = state.wheel_motion.and(log(&motion));
         }
-        // After a frame without a motion, the camera may be anywhere.
-        state.is_carried &= motions.visual.is_some();
+        // After a frame without a motion, the camera may be anywhere. An identical image has none.
+        state.is_carried &= motions.visual.is_some() || state.unchanged_frames > 0;
         if state.is_carried {
             state.sight_ns = Some(frame.time_ns);
         }

@@ -337,6 +337,25 @@ fn restarted_wheels_do_not_move_the_pose() {
     }
 }
 
+/// Oracle: the contract. An image that repeats shows no motion, which is no loss of the images: visual
+/// odometry goes on to carry the pose.
+#[test]
+fn a_repeated_image_does_not_end_the_carried_pose() {
+    let filter = filter();
+    let mut state = filter.start(None);
+    for number in 1..=50 {
+        let is_repeated = number == 35;
+        let observed = ViewObservation {
+            visual: (number > 1 && !is_repeated).then(|| visual(number)),
+            fingerprint: Some(if is_repeated { 34 } else { number }),
+            ..view(number, (number <= 30).then(|| path(number)))
+        };
+        let update = filter.observe(&mut state, &observed).unwrap();
+        let is_tracking = update.status == Status::Tracking;
+        assert!(number < 3 || is_tracking, "{number}: {}", update.reason);
+    }
+}
+
 /// Oracle: the contract of a resumed stream: the map pose is the same to the bit, the covariances are
 /// equal up to single precision, the status goes on, and the odometry begins anew.
 #[test]
