@@ -21,7 +21,7 @@ use super::pose_options::DirectionOption;
 use bag::BagPath;
 use destination::Destination;
 use numpy::Numpy;
-use seese3_data::datasets::{self, Kitti, Reader, Recording, SevenScenes};
+use seese3_data::datasets::{self, ImageTimes, Kitti, Reader, Recording, SevenScenes};
 
 #[derive(Debug, Args)]
 pub struct Import {
@@ -91,6 +91,13 @@ struct Colmap {
     /// Folder that the image names are relative to; searched next to the model if omitted
     #[arg(long, value_name = "DIR")]
     images: Option<PathBuf>,
+    /// Images per second of the video: the last number in the name of an image is its place in it. A room
+    /// without times counts as one of 30 images per second
+    #[arg(long, value_name = "HZ", value_parser = above_zero)]
+    rate: Option<f64>,
+    /// Times of the images: a file with the lines SECONDS NAME
+    #[arg(long, value_name = "FILE", conflicts_with = "rate")]
+    times: Option<PathBuf>,
     #[command(flatten)]
     room: NewRoom,
 }
@@ -118,6 +125,14 @@ struct Euroc {
     device: String,
     #[command(flatten)]
     room: NewRoom,
+}
+
+fn above_zero(text: &str) -> Result<f64, String> {
+    let number: Option<f64> = text.parse().ok();
+    let is_valid = |number: &f64| number.is_finite() && *number > 0.0;
+    number
+        .filter(is_valid)
+        .ok_or_else(|| "must be a number above 0".to_owned())
 }
 
 /// How the poses are read, and where the room is published.
@@ -160,10 +175,15 @@ impl Import {
                     .await
             }
             Format::Colmap(colmap) => {
+                let times = match (colmap.rate, colmap.times) {
+                    (Some(hertz), _) => ImageTimes::Rate(hertz),
+                    (None, Some(file)) => ImageTimes::File(file),
+                    (None, None) => ImageTimes::Unknown,
+                };
                 colmap
                     .room
                     .import("colmap", &colmap.path, |path, reader| {
-                        datasets::read_colmap(path, colmap.images.as_deref(), reader)
+                        datasets::read_colmap(path, colmap.images.as_deref(), &times, reader)
                     })
                     .await
             }

@@ -2,6 +2,7 @@
 //! x right, y down, z forward; quaternions are (w, x, y, z).
 //!
 //! - The unit of translations is arbitrary, unless the model was aligned with known positions.
+//! - A model has no times; see [`ImageTimes`].
 //! - Images are sorted by the numbers in their names. With several folders, each is a sequence.
 //! - COLMAP ignores EXIF orientation: poses refer to the pixels as stored.
 
@@ -12,7 +13,7 @@ use nalgebra::Quaternion;
 
 use super::collect::{About, Collected};
 use super::natural::sort_naturally;
-use super::text::number;
+use super::text::{data_lines, nanoseconds, number, wrong};
 use super::{DropReason, Error, Reader, Recording, read_bytes, read_text};
 use seese3_core::Cause;
 use seese3_core::geometry::{
@@ -29,6 +30,18 @@ const POINT_BYTES: u64 = 24;
 /// The cameras of the model by id; `None` for camera models that [`camera_of`] does not read.
 type Cameras = BTreeMap<u32, Option<PixelCamera>>;
 
+/// When the images of a model were taken. The times of all images are on one clock.
+#[derive(Debug, Clone, Default)]
+pub enum ImageTimes {
+    /// Not known.
+    #[default]
+    Unknown,
+    /// Images per second. The last number in the name of an image counts the images of the video.
+    Rate(f64),
+    /// A file with the lines `SECONDS NAME`, one for each image of the model.
+    File(PathBuf),
+}
+
 /// An image of the model.
 #[derive(Debug, Clone, PartialEq)]
 struct Image {
@@ -41,11 +54,12 @@ struct Image {
 /// is `None`, the usual folders near the model are searched.
 ///
 /// # Errors
-/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if a frame
-/// is unusable and `reader.unusable` is `Refuse`.
+/// [`Error`] if a file cannot be read or is malformed, if an image has no time although times are
+/// given, if no usable frame is left, or if a frame is unusable and `reader.unusable` is `Refuse`.
 pub fn read_colmap(
     path: &Path,
     images: Option<&Path>,
+    times: &ImageTimes,
     reader: &mut Reader<'_>,
 ) -> Result<Recording, Error> {
     let model = model_in(path)?;
@@ -71,12 +85,19 @@ pub fn read_colmap(
     sort_naturally(&mut frames, |frame| &frame.name);
 
     let root = images_root(&model, images, &frames)?;
-    let mut recording = collected(&root, &frames, reader)?;
+    let times = times.of(&frames)?;
+    let mut recording = collected(&root, &frames, &times, reader)?;
     recording.stated.camera = one_camera(&cameras, &frames);
     Ok(recording)
 }
 
-fn collected(root: &Path, frames: &[Image], reader: &mut Reader<'_>) -> Result<Recording, Error> {
+/// `times` are nanoseconds by name; empty if they are not known.
+fn collected(
+    root: &Path,
+    frames: &[Image],
+    times: &BTreeMap<String, i64>,
+    reader: &mut Reader<'_>,
+) -> Result<Recording, Error> {
     // Only images of the same folder are consecutive frames.
     let folder = |name: &str| {
         name.rsplit_once('/')
@@ -107,6 +128,7 @@ fn collected(root: &Path, frames: &[Image], reader: &mut Reader<'_>) -> Result<R
         let about = About {
             image: Some(name.clone()),
             sequence: sequence(&name),
+            timestamp_ns: times.get(&name).copied(),
             name,
             ..About::default()
         };
@@ -114,6 +136,67 @@ fn collected(root: &Path, frames: &[Image], reader: &mut Reader<'_>) -> Result<R
     }
 
     collected.finish(root, reader)
+}
+
+impl ImageTimes {
+    /// Nanoseconds by the name of the image; empty if they are not known.
+    fn of(&self, images: &[Image]) -> Result<BTreeMap<String, i64>, Error> {
+        match self {
+            Self::Unknown => Ok(BTreeMap::new()),
+            Self::Rate(hertz) => {
+                let time = |image: &Image| {
+                    let number = last_number(&image.name).ok_or_else(|| Error::Malformed {
+                        file: PathBuf::from(&image.name),
+                        problem: "has no number in its name, which a rate of images needs; state the times of \
+                                  the images in a file"
+                            .into(),
+                    })?;
+                    Ok((image.name.clone(), (number / hertz * 1e9).round() as i64))
+                };
+                images.iter().map(time).collect()
+            }
+            Self::File(file) => {
+                let times = times_by_name(file)?;
+                let without = images.iter().find(|image| !times.contains_key(&image.name));
+                without.map_or(Ok(times), |image| {
+                    Err(Error::Malformed {
+                        file: file.clone(),
+                        problem: format!("has no line for the image {}", image.name).into(),
+                    })
+                })
+            }
+        }
+    }
+}
+
+/// The last number in a name.
+fn last_number(name: &str) -> Option<f64> {
+    let digits = name
+        .split(|c: char| !c.is_ascii_digit())
+        .rfind(|part| !part.is_empty());
+    digits?.parse().ok()
+}
+
+/// Times by name, from the lines `SECONDS NAME`.
+fn times_by_name(file: &Path) -> Result<BTreeMap<String, i64>, Error> {
+    let text = read_text(file)?;
+    let mut times = BTreeMap::new();
+    for (line, row) in data_lines(&text) {
+        let named = row.trim().split_once(char::is_whitespace);
+        let parsed = named.and_then(|(seconds, name)| Some((nanoseconds(seconds)?, name.trim())));
+        let (time_ns, name) = parsed.ok_or_else(|| {
+            let problem = "is not SECONDS NAME, with the name of an image of the model";
+            wrong(file, line, problem.into())
+        })?;
+        if times.insert(name.to_owned(), time_ns).is_some() {
+            return Err(wrong(
+                file,
+                line,
+                format!("states a second time for the image {name}").into(),
+            ));
+        }
+    }
+    Ok(times)
 }
 
 /// The folder of the model.

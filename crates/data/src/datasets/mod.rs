@@ -28,7 +28,7 @@ pub use arkitscenes::read_arkitscenes;
 #[cfg(feature = "bags")]
 pub use bag::{Bag, WrittenImages, read_bag};
 pub use bundle::{BundleContents, KeypointArrays, read_bundle, read_numpy, write_numpy};
-pub use colmap::read_colmap;
+pub use colmap::{ImageTimes, read_colmap};
 pub use euroc::read_euroc;
 pub use folder::read_folder;
 pub use kitti::{Kitti, read_kitti};

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera};
-use seese3_data::datasets::{read_colmap, read_transforms};
+use seese3_data::datasets::{ImageTimes, read_colmap, read_transforms};
 
 use super::more_datasets::lenient;
 
@@ -31,7 +31,7 @@ fn of_colmap(model: &str) -> Option<CameraIntrinsics> {
     write(folder.path(), "images.txt", "1 1 0 0 0 0 0 0 1 a.png\n\n");
     write(folder.path(), "a.png", "");
 
-    let found = lenient(|reader| read_colmap(folder.path(), None, reader));
+    let found = lenient(|reader| read_colmap(folder.path(), None, &ImageTimes::Unknown, reader));
     found.unwrap().stated.camera
 }
 

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use nalgebra::Matrix4;
 use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera};
 use seese3_data::datasets::{
-    DropReason, Error, Kitti, Reader, Recording, Unusable, read_colmap, read_euroc, read_folder,
-    read_kitti, read_transforms,
+    DropReason, Error, ImageTimes, Kitti, Reader, Recording, Unusable, read_colmap, read_euroc,
+    read_folder, read_kitti, read_transforms,
 };
 
 use seese3_testing::{golden, json};
@@ -69,7 +69,14 @@ fn colmap_models_are_read_in_both_forms() {
         ("colmap", None),
         ("colmap/text", Some(folder("colmap/images"))),
     ] {
-        let found = lenient(|reader| read_colmap(&folder(model), images.as_deref(), reader));
+        let found = lenient(|reader| {
+            read_colmap(
+                &folder(model),
+                images.as_deref(),
+                &ImageTimes::Unknown,
+                reader,
+            )
+        });
         let found = found.unwrap();
         has_poses(&found, 5);
         let lens = Distortion::BrownConrady([0.01, 0.0, 0.0, 0.0, 0.0]);
@@ -93,13 +100,56 @@ fn colmap_models_are_read_in_both_forms() {
     }
 }
 
+/// Oracle: the numbers in the names of the images over the rate, and the lines of the file, by hand.
+#[test]
+fn a_colmap_model_takes_times() {
+    let read = |times: &ImageTimes| {
+        lenient(|reader| read_colmap(&folder("colmap"), None, times, reader))
+            .map(|found| found.frames.timestamps_ns)
+    };
+    assert!(read(&ImageTimes::Unknown).unwrap().is_empty());
+    let by_rate = read(&ImageTimes::Rate(4.0)).unwrap();
+    assert_eq!(
+        by_rate,
+        [0, 250_000_000, 500_000_000, 750_000_000, 2_500_000_000]
+    );
+
+    let file = tempfile::NamedTempFile::new().unwrap();
+    let lines = "# seconds name\n7.5 img_0.png\n8 img_1.png\n9 img_2.png\n10 img_3.png\n11.000000001 img_10.png\n";
+    std::fs::write(file.path(), format!("{lines}12 img_11.png\n")).unwrap();
+    let times = ImageTimes::File(file.path().to_owned());
+    let by_file = read(&times).unwrap();
+    assert_eq!(
+        by_file,
+        [
+            7_500_000_000,
+            8_000_000_000,
+            9_000_000_000,
+            10_000_000_000,
+            11_000_000_001
+        ]
+    );
+
+    std::fs::write(file.path(), lines).unwrap();
+    let error = read(&times).unwrap_err().to_string();
+    assert!(error.contains("img_11.png"), "{error}");
+    std::fs::write(file.path(), format!("{lines}12 img_0.png\n")).unwrap();
+    assert!(
+        read(&times)
+            .unwrap_err()
+            .to_string()
+            .contains("second time")
+    );
+}
+
 /// Oracle: the format: every cut of a file is refused, and no size in it is believed.
 #[test]
 fn hostile_colmap_files_are_refused() {
     let copy = tempfile::tempdir().unwrap();
     let model = folder("colmap/sparse/0");
     let images = folder("colmap/images");
-    let read = || lenient(|reader| read_colmap(copy.path(), Some(&images), reader));
+    let read =
+        || lenient(|reader| read_colmap(copy.path(), Some(&images), &ImageTimes::Unknown, reader));
     for (cut_file, other) in [("images.bin", "cameras.bin"), ("cameras.bin", "images.bin")] {
         std::fs::copy(model.join(other), copy.path().join(other)).unwrap();
         let whole = std::fs::read(model.join(cut_file)).unwrap();
@@ -118,7 +168,8 @@ fn hostile_colmap_files_are_refused() {
     assert!(read().is_ok());
 
     let empty = tempfile::tempdir().unwrap();
-    let error = lenient(|reader| read_colmap(empty.path(), None, reader)).unwrap_err();
+    let error = lenient(|reader| read_colmap(empty.path(), None, &ImageTimes::Unknown, reader))
+        .unwrap_err();
     assert!(error.to_string().contains("sparse/0"), "{error}");
 }
 
