@@ -57,6 +57,7 @@ from .errors import (
     SeeseError,
     UnavailableError,
 )
+from .newest import AsyncNewest, Newest
 from .program import Server, run, serve
 from .requests import Gravity, InitialPose, Odometry, Prediction, Question, RigCamera, TrackConfig, Upload
 from .store import Store, StoredAdapter, StoredKeypoints, StoredRoom
@@ -67,6 +68,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Adapter",
     "AsyncClient",
+    "AsyncNewest",
     "AsyncTrack",
     "BusyError",
     "Camera",
@@ -94,6 +96,7 @@ __all__ = [
     "MotionScores",
     "Navigation",
     "NavigatorScores",
+    "Newest",
     "NotFoundError",
     "Odometry",
     "Place",

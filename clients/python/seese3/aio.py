@@ -711,7 +711,8 @@ class AsyncTrack:
 
         `ahead` frames are sent before the answer to the first of them is awaited: 0 for a camera, whose next frame is
         not there yet; some 16 for a recording, which is then followed faster than frame by frame. Frames that were sent
-        ahead have been seen: after a loop that was left early, the stream goes on behind them.
+        ahead have been seen: after a loop that was left early, the stream goes on behind them. A camera that may be
+        faster than the server is wrapped in `Newest`, or `AsyncNewest`: frames are then skipped, and none is late.
         """
         if ahead < 0:
             raise ValueError(f"ahead: {ahead} is below 0")

@@ -1,12 +1,51 @@
 """One Track stream: requests in, answers out, by however many calls it takes."""
 
-import queue
+import collections
 import threading
 
 from seese3.v1 import odometry_pb2, odometry_pb2_grpc
 
-# So many requests wait for the server; the oldest goes when another comes.
+# Frames that may wait for the server; the oldest is dropped for another. Two, because a frame that waited for other
+# cameras is offered together with the next one.
+FRAMES = 2
+# Requests other than frames, such as an initial pose, that may wait for the server; the oldest is dropped for another.
 WAITING = 8
+
+
+class Requests:
+    """Requests that wait for the server, in order. Only the newest frames wait: none is sent late."""
+
+    def __init__(self):
+        self.waiting, self.changed, self.call = collections.deque(), threading.Condition(), 0
+
+    def offer(self, request):
+        """Adds a request; returns whether another was dropped for it."""
+        is_frame = request.HasField("frame")
+        with self.changed:
+            alike = [other for other in self.waiting if other.HasField("frame") == is_frame]
+            is_dropped = len(alike) >= (FRAMES if is_frame else WAITING)
+            if is_dropped:
+                self.waiting.remove(alike[0])
+            self.waiting.append(request)
+            self.changed.notify_all()
+            return is_dropped
+
+    def begin(self):
+        """Begins a new call, and returns its number: an earlier call gets no more requests."""
+        with self.changed:
+            self.call += 1
+            self.changed.notify_all()
+            return self.call
+
+    def of_call(self, call):
+        """The requests of a call, until the next one begins."""
+        while True:
+            with self.changed:
+                self.changed.wait_for(lambda: self.waiting or self.call != call)
+                if self.call != call:
+                    return
+                request = self.waiting.popleft()
+            yield request
 
 
 class Stream:
@@ -14,45 +53,23 @@ class Stream:
 
     def __init__(self, channel, config):
         self.stub, self.config, self.token = odometry_pb2_grpc.OdometryServiceStub(channel), config, b""
-        self.frames, self.lock = queue.Queue(maxsize=WAITING), threading.Lock()
-
-    def requests(self, frames):
-        resumed = odometry_pb2.TrackConfig(resume_token=self.token)
-        yield odometry_pb2.TrackRequest(config=resumed if self.token else self.config)
-        while (request := frames.get()) is not None:
-            yield request
+        self.requests = Requests()
 
     def offer(self, request):
-        """Takes a request; whether the oldest that waited went, because there was no room."""
-        with self.lock:
-            is_full = self.frames.full()
-            if is_full:
-                self.frames.get_nowait()
-            self.frames.put_nowait(request)
-            return is_full
+        """Adds a request; returns whether another was dropped for it."""
+        return self.requests.offer(request)
 
-    def begin(self):
-        """A queue for a new call, with what waits for one: an old call must not take a new one's frames."""
-        with self.lock:
-            waiting, self.frames = self.frames, queue.Queue(maxsize=WAITING)
-            while not waiting.empty():
-                if (request := waiting.get_nowait()) is not None:
-                    self.frames.put_nowait(request)
-            return self.frames
+    def sent(self, call):
+        resumed = odometry_pb2.TrackConfig(resume_token=self.token)
+        yield odometry_pb2.TrackRequest(config=resumed if self.token else self.config)
+        yield from self.requests.of_call(call)
 
     def answers(self):
         """Answers until the call ends."""
-        frames = self.begin()
+        call = self.requests.begin()
         try:
-            for answer in self.stub.Track(self.requests(frames)):
+            for answer in self.stub.Track(self.sent(call)):
                 self.token = answer.resume_token or self.token
                 yield answer
         finally:
-            # Ends the requests of the call that is over; what waits is for the next one.
-            with self.lock:
-                waiting = queue.Queue(maxsize=WAITING)
-                while not frames.empty():
-                    waiting.put_nowait(frames.get_nowait())
-                frames.put_nowait(None)
-                if self.frames is frames:
-                    self.frames = waiting
+            self.requests.begin()

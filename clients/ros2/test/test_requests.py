@@ -9,8 +9,10 @@ from PIL import Image as Picture
 
 stand_in.install()
 
-from sensor_msgs.msg import CameraInfo, Image, Imu  # noqa: E402
+from seese3.v1 import odometry_pb2  # noqa: E402
 from seese3_bridge import requests  # noqa: E402
+from seese3_bridge.stream import Requests  # noqa: E402
+from sensor_msgs.msg import CameraInfo, Image, Imu  # noqa: E402
 
 
 def raw(encoding, rows, step):
@@ -136,3 +138,22 @@ def test_what_tells_no_direction_is_not_sent():
     assert gravity.after(imu(0, (0.0, 0.0, 0.0))) is None
     assert gravity.after(imu(0, (math.nan, 0.0, 9.8))) is None
     assert direction(gravity.after(imu(60, (0.0, 0.0, 9.8)))) == pytest.approx((0, 0, -9.8))
+
+
+def test_only_the_newest_frames_wait():
+    """Oracle: by hand. Requests other than frames keep their order and are not dropped for frames."""
+    waiting = Requests()
+
+    def frame(number):
+        return odometry_pb2.TrackRequest(frame=odometry_pb2.TrackFrame(sequence=number))
+
+    pose = odometry_pb2.TrackRequest(set_initial_pose=odometry_pb2.SetInitialPose())
+    assert [waiting.offer(request) for request in (frame(1), pose, frame(2), frame(3))] == [False, False, False, True]
+
+    sent = waiting.of_call(waiting.begin())
+    assert next(sent) == pose
+    assert [next(sent).frame.sequence for _ in range(2)] == [2, 3]
+    waiting.offer(frame(4))
+    second = waiting.of_call(waiting.begin())
+    assert list(sent) == []
+    assert next(second).frame.sequence == 4

@@ -33,6 +33,7 @@
 //! | --- | --- |
 //! | [`Client`] | a connection, with one method per RPC |
 //! | [`proto::v1`] | wire types, generated from `proto/seese3/v1`, which documents every field |
+//! | [`Newest`] | newest-frame mode for a camera that is faster than the server |
 //! | [`convert`] | conversion of poses and motions to nalgebra types |
 //!
 //! Conventions: meters, radians, seconds; camera axes x right, y down, z forward; poses are
@@ -44,9 +45,11 @@
 pub mod proto;
 pub mod convert;
 mod client;
+mod newest;
 
 pub use client::{Client, ClientTls, ConnectOptions, Error};
 /// The types used by [`convert`].
 pub use nalgebra;
+pub use newest::Newest;
 /// The types of streams and statuses.
 pub use tonic;
