@@ -88,10 +88,6 @@ pub struct Serve {
         value_delimiter = ','
     )]
     encoders: Vec<String>,
-    /// XFeat's ONNX file: enables motion estimation between two images of a known camera by feature
-    /// matching, also in unmapped rooms
-    #[arg(long, value_name = "FILE", env = "SEESE3_TWO_VIEW")]
-    two_view: Option<PathBuf>,
     /// Runtime for ONNX models: tract needs no library, onnxruntime is faster
     #[arg(long, env = "SEESE3_RUNTIME", value_parser = one_of::<RuntimeKind>(), default_value = "tract")]
     runtime: RuntimeKind,
@@ -350,10 +346,9 @@ impl Serve {
                 preload: self.preload,
                 bytes: self.max_room_bytes,
             },
-            encoders: (!self.encoders.is_empty() || self.two_view.is_some()).then(|| {
+            encoders: (!self.encoders.is_empty()).then(|| {
                 ImageEncoders {
                     models: self.encoders.clone(),
-                    two_view: self.two_view.clone(),
                     runtime: Runtime {
                         kind: self.runtime,
                         threads,

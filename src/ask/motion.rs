@@ -107,7 +107,7 @@ impl Motion {
             .context("the server sent no motion")?;
 
         match answer.reader() {
-            pb::MotionReader::TwoView => say("estimated by feature matching between the images"),
+            pb::MotionReader::TwoView => say("estimated by matched keypoints"),
             pb::MotionReader::None => {
                 say("the images have too little in common: no motion was estimated");
             }

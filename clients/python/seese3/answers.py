@@ -635,7 +635,10 @@ class Way:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The motion (6,) from one view to another. `reader` is "adapter", "two_view", or "none": nothing could read it."""
+    """The motion (6,) from one view to another.
+
+    `reader` is "adapter", "two_view" (matched keypoints), or "none": the views have too little in common.
+    """
 
     twist: Array
     covariance: Array | None

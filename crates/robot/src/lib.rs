@@ -38,6 +38,7 @@
 //! | module | purpose |
 //! | --- | --- |
 //! | [`matched_views`] | estimates a view's pose from keypoints matched with mapped keypoints |
+//! | [`two_view`] | estimates the motion between two views without a map, by matched keypoints |
 //! | [`visual_odometry`] | estimates a camera's motion from its images, without a map |
 //! | [`tracking`] | tracks a camera frame by frame, with covariances |
 //! | [`pose_filter`] | tracks a camera by located views, without an adapter |
@@ -46,18 +47,17 @@
 //! | [`planning`] | plans a route from a view to a goal, over a room's frames |
 //! | [`calibration`] | measures an adapter's errors in rooms that it was not trained on |
 //! | [`fitting`] | fits an adapter to one mapped room and localizes single views in it |
-//! | [`two_view`] | estimates the motion between two views from matched image cells |
 //!
 //! Conventions are those of [`seese3_core`]. This crate does not access files, the network, the
 //! clock or the environment. Random numbers come from explicit seeds.
 
 pub mod matched_views;
+pub mod two_view;
 pub mod visual_odometry;
 pub mod tracking;
 pub mod pose_filter;
 pub mod localization;
 pub mod front_end;
-pub mod two_view;
 pub mod calibration;
 pub mod planning;
 pub mod fitting;

@@ -219,8 +219,8 @@ fn adapter_without_room<'a>(
         1 => snapshot.adapters().values().next().ok_or(Error::Internal),
         count => {
             let problem = format!(
-                "is required when no room is named: the server has {count} adapters; with a two-view model, two images \
-                 with `camera` need no adapter"
+                "is required when no room is named: the server has {count} adapters; two images with `camera` need \
+                 none if the server detects keypoints"
             );
             Err(Error::invalid("adapter", problem))
         }

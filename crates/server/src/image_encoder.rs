@@ -2,7 +2,6 @@
 //! made the adapter's features.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -19,8 +18,6 @@ use seese3_store::StoredAdapter;
 pub struct ImageEncoders {
     /// The encoders of the adapters' features: `builtin`, `pixels`, or paths of ONNX files.
     pub models: Vec<String>,
-    /// XFeat's ONNX file, for the motion between two images; `None` disables that.
-    pub two_view: Option<PathBuf>,
     /// The runtime that executes ONNX models.
     pub runtime: Runtime,
     /// The largest size of one image, encoded and decoded.

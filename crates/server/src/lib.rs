@@ -64,7 +64,6 @@ pub use tls::{Tls, TlsError, TlsFiles};
 pub use traces::Traces;
 pub use track::TokenKey;
 
-use seese3_core::Cause;
 use std::convert::Infallible;
 use std::future::Future;
 use std::pin::Pin;
@@ -211,12 +210,6 @@ pub enum RunError {
         model: String,
         #[source]
         problem: seese3_encoder::Error,
-    },
-    #[error("--two-view {}: {problem}; give XFeat's ONNX file (`seese3 encoders` says how to export it)", file.display())]
-    TwoView {
-        file: std::path::PathBuf,
-        #[source]
-        problem: Cause,
     },
     #[error("the server failed: {0}")]
     Transport(#[from] tonic::transport::Error),

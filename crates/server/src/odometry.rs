@@ -6,6 +6,7 @@ use tonic::{Request, Response, Status};
 
 use super::convert;
 use super::embedding::RequestAdapter;
+use super::two_views;
 use super::workers::Lane;
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
@@ -58,14 +59,14 @@ fn answer(
 
     // Two images and no adapter: the caller may have forgotten the camera. Extend the error
     // message.
-    let lacks_camera = snapshot.two_views().is_some()
+    let lacks_camera = snapshot.keypoint_encoder_for(None).is_some()
         && request.adapter.is_empty()
         && image(request.first.as_ref()).is_some()
         && image(request.second.as_ref()).is_some();
     by_adapter(snapshot, request, cancel).map_err(|error| match error {
         Error::Precondition(problem) if lacks_camera => Error::Precondition(format!(
-            "{problem}; or give `camera`, or a room whose camera is known: the two-view model of this server then \
-             needs no adapter"
+            "{problem}; or give `camera`, or a room whose camera is known: this server then matches the keypoints of \
+             the images, without an adapter"
         )),
         other => other,
     })
@@ -139,8 +140,8 @@ fn by_adapter(
     })
 }
 
-/// Estimates the motion with the two-view model. `None` if the request names an adapter, this
-/// server has no such model, a view is not an image, or the camera is unknown.
+/// Estimates the motion from matched keypoints. `None` if the request names an adapter, this server
+/// has no encoder of keypoints, a view is not an image, or the camera is unknown.
 fn by_two_views(
     snapshot: &Snapshot,
     request: &pb::EstimateMotionRequest,
@@ -149,8 +150,12 @@ fn by_two_views(
     // Check a given camera for both estimators.
     let stated = request.camera.as_ref().map(convert::camera).transpose()?;
 
-    let (Some(reader), Some(first), Some(second), "") = (
-        snapshot.two_views(),
+    let served = match request.room.as_str() {
+        "" => None,
+        name => Some(snapshot.room(name)?),
+    };
+    let (Some(encoder), Some(first), Some(second), "") = (
+        snapshot.keypoint_encoder_for(served.map(AsRef::as_ref)),
         image(request.first.as_ref()),
         image(request.second.as_ref()),
         request.adapter.as_str(),
@@ -158,11 +163,7 @@ fn by_two_views(
         return Ok(None);
     };
 
-    let of_room = if request.room.is_empty() {
-        None
-    } else {
-        snapshot.room(&request.room)?.summary.provenance.camera
-    };
+    let of_room = served.and_then(|served| served.summary.provenance.camera);
     let Some(camera) = stated.or(of_room) else {
         if request.room.is_empty() && snapshot.adapters().is_empty() {
             return Err(Error::invalid(
@@ -174,7 +175,7 @@ fn by_two_views(
         return Ok(None);
     };
 
-    let estimate = reader.read(first, second, &camera, cancel)?;
+    let estimate = two_views::estimate(encoder, [first, second], &camera, cancel)?;
     let reader = if estimate.is_estimated {
         pb::MotionReader::TwoView
     } else {

@@ -41,7 +41,7 @@ pub mod tracking_scores;
 use seese3_core::room::Room;
 use seese3_core::splits::HoldOut;
 use seese3_core::{adapter, eval, navigation, splits, training, trajectory};
-use seese3_robot::{calibration, fitting, tracking, two_view};
+use seese3_robot::{calibration, fitting, tracking};
 
 use crate::probes;
 
@@ -93,9 +93,6 @@ pub enum Error {
     /// Features could not be probed.
     #[error(transparent)]
     Probe(#[from] probes::Error),
-    /// The motion between two views could not be estimated.
-    #[error(transparent)]
-    TwoView(#[from] two_view::Error),
     /// A room has no training or no test pairs under a split.
     #[error(transparent)]
     Splits(#[from] splits::Error),

@@ -1,18 +1,19 @@
 //! Evaluates motion estimates between two views of a room: by an adapter, by a two-view estimator,
 //! and by simple baselines.
 
-use ndarray::ArrayView3;
 use rayon::prelude::*;
 use serde::Serialize;
 
 use seese3_core::adapter::Adapter;
 use seese3_core::features::Features;
 use seese3_core::geometry::{CameraIntrinsics, PoseError, Twist, exp, log};
+use seese3_core::keypoints::Keypoints;
 use seese3_core::nalgebra::Cholesky;
-use seese3_core::room::Room;
+use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::Pair;
 use seese3_core::statistics::{Coverage, coverage};
 use seese3_core::training::motions;
+use seese3_robot::matched_views::ViewKeypoints;
 use seese3_robot::two_view;
 
 use super::Error;
@@ -30,7 +31,7 @@ pub struct MotionEvaluation {
     pub without_mean: Option<LocalizationErrors>,
     /// The constant baseline, which always predicts μ.
     pub constant: Option<LocalizationErrors>,
-    /// Errors of the two-view estimator, if feature maps were given.
+    /// Errors of the two-view estimator, if keypoints were given.
     pub two_view: Option<TwoViewErrors>,
     /// Errors of the zero-motion baseline.
     pub no_motion: LocalizationErrors,
@@ -49,13 +50,11 @@ pub struct TwoViewErrors {
     pub coverage: Coverage,
 }
 
-/// The feature maps of a room's frames, for a two-view estimator.
+/// The keypoints of a room's frames, for the two-view estimator.
 #[derive(Debug, Clone, Copy)]
-pub struct Maps<'a> {
-    /// One flattened map per row, in the order (channels, rows, columns).
-    pub features: &'a Features,
-    /// Channels, rows and columns of a map; their product is the feature width.
-    pub shape: [usize; 3],
+pub struct FrameKeypoints<'a> {
+    /// One per row.
+    pub keypoints: &'a [Keypoints],
     /// The camera that took the images.
     pub camera: CameraIntrinsics,
 }
@@ -64,12 +63,11 @@ pub struct Maps<'a> {
 /// of the two-view estimator.
 ///
 /// # Errors
-/// [`Error::Adapter`] when the features do not match the adapter, [`Error::TwoView`] when the maps
-/// are too small.
+/// [`Error::Adapter`] when the features do not match the adapter.
 pub fn evaluate(
     room: &Room,
     adapter: Option<(&Adapter, &Features)>,
-    maps: Option<Maps<'_>>,
+    views: Option<FrameKeypoints<'_>>,
     pairs: &[Pair],
     on_pair_read: &(dyn Fn() + Sync),
 ) -> Result<MotionEvaluation, Error> {
@@ -84,9 +82,7 @@ pub fn evaluate(
         ours,
         without_mean,
         constant,
-        two_view: maps
-            .map(|maps| by_two_views(maps, pairs, &truth, on_pair_read))
-            .transpose()?,
+        two_view: views.map(|views| by_two_views(views, pairs, &truth, on_pair_read)),
         no_motion: errors(&truth, &vec![Twist::default(); truth.len()]),
     })
 }
@@ -121,30 +117,23 @@ fn by_adapter(
 }
 
 fn by_two_views(
-    maps: Maps<'_>,
+    views: FrameKeypoints<'_>,
     pairs: &[Pair],
     truth: &[Twist],
     on_pair_read: &(dyn Fn() + Sync),
-) -> Result<TwoViewErrors, Error> {
-    let rows = maps.features.rows();
-    let map = |row: usize| {
-        let numbers = rows.row(row).to_slice().unwrap_or_default();
-        ArrayView3::from_shape(maps.shape, numbers).map_err(|_| two_view::Error::Shape {
-            first: maps.shape,
-            second: maps.shape,
-        })
+) -> TwoViewErrors {
+    let view = |frame: FrameId| ViewKeypoints {
+        keypoints: &views.keypoints[frame.row()],
+        camera: &views.camera,
     };
     let readings: Vec<two_view::MotionEstimate> = pairs
         .par_iter()
         .map(|pair| {
-            let first = map(pair.source.row())?;
-            let second = map(pair.target.row())?;
-            let reading = two_view::read(first, second, &maps.camera);
+            let reading = two_view::estimate(view(pair.source), view(pair.target));
             on_pair_read();
-
             reading
         })
-        .collect::<Result<_, _>>()?;
+        .collect();
 
     let read: Vec<Twist> = readings
         .iter()
@@ -164,11 +153,11 @@ fn by_two_views(
         .filter(|reading| reading.is_estimated)
         .count();
 
-    Ok(TwoViewErrors {
+    TwoViewErrors {
         ours: errors(truth, &read),
         answered: answered as f64 / readings.len() as f64,
         coverage: coverage(&lengths),
-    })
+    }
 }
 
 fn errors(truth: &[Twist], read: &[Twist]) -> LocalizationErrors {

@@ -160,3 +160,32 @@ pub(super) fn mutual_matches(
         .map(|(row, &(column, _))| (row, column))
         .collect()
 }
+
+/// Pairs of keypoints of two views, by their places, that are each other's most similar one and whose
+/// cosine is at least `min_cosine`, among the first `candidates` of each; empty if the descriptors
+/// have different widths.
+pub(crate) fn matched_keypoints(
+    first: &Keypoints,
+    second: &Keypoints,
+    candidates: usize,
+    min_cosine: f32,
+) -> Vec<(usize, usize)> {
+    let unit = |keypoints: &Keypoints| {
+        let count = keypoints.len().min(candidates);
+        let mut rows = Array2::zeros((count, keypoints.descriptor_width()));
+        for (place, mut row) in rows.outer_iter_mut().enumerate() {
+            for (to, &from) in row.iter_mut().zip(keypoints.descriptor(place)) {
+                *to = f32::from(from);
+            }
+            let length = row.dot(&row).sqrt().max(1e-9);
+            row /= length;
+        }
+        rows
+    };
+
+    let [a, b] = [unit(first), unit(second)];
+    if a.ncols() != b.ncols() {
+        return Vec::new();
+    }
+    mutual_matches(a.view(), b.view(), min_cosine)
+}

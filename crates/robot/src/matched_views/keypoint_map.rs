@@ -1,12 +1,11 @@
 //! The keypoints of a mapped room, with their inverse depths.
 
 use nalgebra::{Point3, Vector2, Vector3};
-use ndarray::Array2;
 use rayon::prelude::*;
 
 use super::Error;
 use super::absolute_pose::MapNoise;
-use super::descriptors::{COMPRESSED, DescriptorBasis, mutual_matches};
+use super::descriptors::{COMPRESSED, DescriptorBasis, matched_keypoints};
 use super::parameters::MappingParameters;
 use super::triangulation::{PosedKeypoints, pixel_focal, triangulate};
 use seese3_core::epipolar::{EpipolarPairs, angle_between_axes};
@@ -366,29 +365,11 @@ pub fn epipolar_pairs(
 
 /// Image points, image widths, of the mutual matches of two frames.
 fn matched_points(first: &Keypoints, second: &Keypoints, height: f64) -> Vec<[Vector2<f64>; 2]> {
-    let unit = |keypoints: &Keypoints| {
-        let count = keypoints.len().min(EPIPOLAR_CANDIDATES);
-        let width = keypoints.descriptor_width();
-        let mut rows = Array2::zeros((count, width));
-        for (place, mut row) in rows.outer_iter_mut().enumerate() {
-            for (to, &from) in row.iter_mut().zip(keypoints.descriptor(place)) {
-                *to = f32::from(from);
-            }
-            let length = row.dot(&row).sqrt().max(1e-9);
-            row /= length;
-        }
-        rows
-    };
     let point = |keypoints: &Keypoints, place: usize| {
         let point = keypoints.points()[place];
         Vector2::new(f64::from(point.x), f64::from(point.y) * height)
     };
-
-    let [a, b] = [unit(first), unit(second)];
-    if a.ncols() != b.ncols() {
-        return Vec::new();
-    }
-    mutual_matches(a.view(), b.view(), EPIPOLAR_MIN_COSINE)
+    matched_keypoints(first, second, EPIPOLAR_CANDIDATES, EPIPOLAR_MIN_COSINE)
         .into_iter()
         .map(|(i, j)| [point(first, i), point(second, j)])
         .collect()

@@ -19,6 +19,7 @@ mod triangulation;
 
 pub(crate) use absolute_pose::{Correspondence, Search, find_pose};
 pub use absolute_pose::{MapNoise, PoseInformation};
+pub(crate) use descriptors::matched_keypoints;
 pub use descriptors::{COMPRESSED, DescriptorBasis, MAX_WIDTH};
 pub use focal_fit::FocalFit;
 pub use keypoint_map::{KeypointMap, MappedKeypoints, Mapping, epipolar_pairs};

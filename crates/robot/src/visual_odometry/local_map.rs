@@ -6,27 +6,17 @@ use nalgebra::{Point3, Vector2, Vector3};
 
 use super::KnownDepth;
 use super::parameters::OdometryParameters;
+use crate::two_view::usual_log_inverse_depth;
 use seese3_core::geometry::Pose;
 use seese3_core::keypoints::Keypoints;
 use seese3_core::statistics::median;
 
-/// Usual logarithm of the inverse depth in a room, 1/m, at a point (x, y) on the plane at depth 1:
-/// coefficients of 1, x, y, x², xy and y². The edges of an image are nearer than its center. Fitted
-/// to drawn rooms and one photographed room.
-const USUAL_LOG_INVERSE_DEPTH: [f64; 6] = [-0.9446, -0.1065, -0.0705, 0.4672, 0.0214, 0.2502];
 /// Range of the factor by which one keyframe changes the expected depths.
 const DEPTH_FACTORS: [f64; 2] = [0.5, 2.0];
 /// Smallest relative deviation of a known depth.
 const MIN_DEPTH_DEVIATION: f64 = 0.02;
 /// Minimum depth of a landmark, meters.
 const MIN_DEPTH_M: f64 = 1e-3;
-
-/// Usual inverse depth in a room at a point on the plane at depth 1, 1/m.
-pub(super) fn usual_inverse_depth(point: &Vector2<f64>) -> f64 {
-    let (x, y) = (point.x, point.y);
-    let [one, of_x, of_y, of_xx, of_xy, of_yy] = USUAL_LOG_INVERSE_DEPTH;
-    (one + of_x * x + of_y * y + of_xx * x * x + of_xy * x * y + of_yy * y * y).exp()
-}
 
 /// A keypoint of a keyframe: the number of the keyframe, and the keypoint's place in it.
 pub(super) type KeypointId = (u64, usize);
@@ -163,7 +153,7 @@ impl LocalMap {
 
     /// Inverse depth that a new landmark at a point on the plane at depth 1 is expected at.
     pub fn expected_inverse_depth(&self, point: &Vector2<f64>) -> f64 {
-        usual_inverse_depth(point) * self.depth_factor
+        usual_log_inverse_depth(*point).exp() * self.depth_factor
     }
 
     /// Expected depth in the center of an image, meters.

@@ -17,7 +17,6 @@ use tokio::runtime::Handle;
 
 use super::super::image_encoder::{self, ImageEncoder, ImageEncoders};
 use super::super::metrics::Metrics;
-use super::super::two_views::TwoViewReader;
 use super::super::{Config, RunError};
 use super::cache::RoomCache;
 use super::loaded::Candidate;
@@ -70,7 +69,6 @@ pub struct Loader {
     rooms: Arc<RoomCache>,
     memory: RoomMemory,
     encoders: Option<ImageEncoders>,
-    two_views: Option<Arc<TwoViewReader>>,
     metrics: Metrics,
 }
 
@@ -78,7 +76,7 @@ impl Loader {
     /// Creates a loader of `store`. Reads the operator's models, on a blocking thread.
     ///
     /// # Errors
-    /// [`RunError::Model`] or [`RunError::TwoView`] if a model cannot be used.
+    /// [`RunError::Model`] if a model cannot be used.
     pub async fn open(store: Store, config: &Config) -> Result<Self, RunError> {
         let Config {
             index,
@@ -92,7 +90,6 @@ impl Loader {
             if let Some(encoders) = &encoders {
                 image_encoder::check_models(&encoders.models)?;
             }
-            let two_views = TwoViewReader::open(encoders.as_ref())?.map(Arc::new);
 
             let loader = RoomLoader {
                 store: store.clone(),
@@ -106,7 +103,6 @@ impl Loader {
                 rooms,
                 memory,
                 encoders,
-                two_views,
                 metrics,
             })
         })
@@ -172,7 +168,6 @@ impl Loader {
         refused: Refused,
     ) -> Result<Snapshot, RunError> {
         let mut loaded = Snapshot {
-            two_views: self.two_views.clone(),
             ..Snapshot::default()
         };
 

@@ -21,7 +21,6 @@ use super::Error;
 use super::auth::RoomScope;
 use super::image_encoder::ImageEncoder;
 use super::metrics::ServedCounts;
-use super::two_views::TwoViewReader;
 use seese3_core::keypoints::KeypointSource;
 use seese3_store::StoredAdapter;
 
@@ -76,7 +75,6 @@ pub struct Snapshot {
     image_encoders: BTreeMap<String, Arc<ImageEncoder>>,
     /// Encoders of the rooms' keypoints.
     keypoint_encoders: KeypointEncoders,
-    two_views: Option<Arc<TwoViewReader>>,
     refused: Refusals,
 }
 
@@ -103,7 +101,6 @@ impl Snapshot {
             adapters: owned(self.adapters.iter().filter(is_seen)),
             image_encoders: self.image_encoders.clone(),
             keypoint_encoders: self.keypoint_encoders.clone(),
-            two_views: self.two_views.clone(),
             refused: Refusals {
                 rooms: owned(refused_rooms.filter(|(name, _)| scope.contains(name))),
                 // An adapter may be named after its room.
@@ -175,11 +172,6 @@ impl Snapshot {
             && self.refused == other.refused
     }
 
-    /// The two-view motion estimator, if this server has one.
-    pub fn two_views(&self) -> Option<&TwoViewReader> {
-        self.two_views.as_deref()
-    }
-
     /// The image encoder of an adapter.
     ///
     /// # Errors
@@ -200,6 +192,15 @@ impl Snapshot {
         let mut encoders = self.keypoint_encoders.iter();
         let (_, encoder) = encoders.find(|(made, _)| made.is_like(source))?;
         Some(encoder)
+    }
+
+    /// An encoder of keypoints for images that are matched with each other: that of a room's
+    /// keypoints, else any; `None` if this server has none.
+    pub fn keypoint_encoder_for(&self, room: Option<&ServedRoom>) -> Option<&ImageEncoder> {
+        let source = room.and_then(|room| room.summary.keypoints.as_ref());
+        let of_room = source.and_then(|source| self.keypoint_encoder(source));
+        let any = self.keypoint_encoders.first();
+        of_room.or_else(|| any.map(|(_, encoder)| encoder.as_ref()))
     }
 
     /// Number of rooms.

@@ -77,7 +77,6 @@ async fn drawn_store() -> (tempfile::TempDir, Store, Vec<RgbImage>) {
 
 fn with_encoders(models: &[&str]) -> Config {
     let encoders = ImageEncoders {
-        two_view: None,
         models: models.iter().map(|&model| model.to_owned()).collect(),
         runtime: Runtime {
             kind: RuntimeKind::Tract,
