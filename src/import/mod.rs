@@ -174,19 +174,7 @@ impl Import {
                     .import("folder", |path, _| datasets::read_folder(path))
                     .await
             }
-            Format::Colmap(colmap) => {
-                let times = match (colmap.rate, colmap.times) {
-                    (Some(hertz), _) => ImageTimes::Rate(hertz),
-                    (None, Some(file)) => ImageTimes::File(file),
-                    (None, None) => ImageTimes::Unknown,
-                };
-                colmap
-                    .room
-                    .import("colmap", &colmap.path, |path, reader| {
-                        datasets::read_colmap(path, colmap.images.as_deref(), &times, reader)
-                    })
-                    .await
-            }
+            Format::Colmap(colmap) => colmap.import().await,
             Format::Transforms(plain) => {
                 plain.import("transforms", datasets::read_transforms).await
             }
@@ -227,6 +215,22 @@ fn scannet(path: &Path, reader: &mut Reader<'_>) -> Result<Recording, datasets::
         datasets::read_sens(path, reader)
     } else {
         datasets::read_scannet(path, reader)
+    }
+}
+
+impl Colmap {
+    async fn import(self) -> anyhow::Result<()> {
+        let times = match (self.rate, self.times) {
+            (Some(hertz), _) => ImageTimes::Rate(hertz),
+            (None, Some(file)) => ImageTimes::File(file),
+            (None, None) => ImageTimes::Unknown,
+        };
+        let images = self.images.as_deref();
+        self.room
+            .import("colmap", &self.path, |path, reader| {
+                datasets::read_colmap(path, images, &times, reader)
+            })
+            .await
     }
 }
 

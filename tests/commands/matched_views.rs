@@ -98,7 +98,8 @@ fn a_view_is_located_by_its_keypoints_without_an_adapter() {
         "train --store store --room kitchen --features builtin --split whole --stride 4 --epochs 1 --name blind",
     );
 
-    let server = here.serve("--encoder model.onnx");
+    fs::write(here.file("key"), [7; 32]).unwrap();
+    let server = here.serve("--encoder model.onnx --token-key-file key");
     let to = format!("--server {}", server.address);
     let ask = format!("localize {to} --room kitchen --image view.jpg");
 
@@ -191,10 +192,33 @@ fn tracks_without_an_adapter(here: &Place, to: &str) {
     let error = (nalgebra::Vector3::new(x, y, z) - truth.translation.vector).norm();
     assert!(error < 0.03, "{error}");
 
+    assert!(fs::metadata(here.file("token")).unwrap().len() < 600);
+    let resumed = "--images stream --from 3 --resume token";
     here.prints(
-        &format!("track {to} --images stream --from 3 --resume token"),
+        &format!("track {to} {resumed} --json here.jsonl"),
         &["2 of them TRACKING"],
     );
+
+    // At another server with the same key and store, the answers are the same to the bit.
+    let other = here.serve("--encoder model.onnx --token-key-file key");
+    here.succeeds(&format!(
+        "track --server {} {resumed} --json there.jsonl",
+        other.address
+    ));
+    let answers = |file: &str| -> Vec<Value> {
+        let text = fs::read_to_string(here.file(file)).unwrap();
+        let mut answers: Vec<Value> = text
+            .lines()
+            .map(|line| serde_json::from_str(line).unwrap())
+            .collect();
+        for answer in &mut answers {
+            // The time that the answer took.
+            answer.as_object_mut().unwrap().remove("elapsed_ns");
+        }
+        answers
+    };
+    assert_eq!(answers("here.jsonl").len(), 2);
+    assert_eq!(answers("here.jsonl"), answers("there.jsonl"));
 
     // An image tells more than a feature, and the filter needs one.
     here.succeeds("export numpy --store store --room kitchen --out exported");

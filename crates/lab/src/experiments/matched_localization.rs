@@ -8,13 +8,15 @@ use ndarray::{Array2, ArrayView1, ArrayView2};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use seese3_core::geometry::{CameraIntrinsics, Pose, PoseError, log};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use seese3_core::geometry::{CameraIntrinsics, Pose, PoseError, Twist, exp, log};
 use seese3_core::keypoints::Keypoints;
 use seese3_core::room::FrameId;
 use seese3_core::statistics::{
     Coverage, RecordedMedian, coverage, median_of_recording, root_mean_square,
 };
-use seese3_robot::localization::{KeypointRoom, NotLocated};
+use seese3_robot::localization::{KeypointRoom, LocatedView, NotLocated};
 use seese3_robot::matched_views::{Mapping, MappingParameters, ViewKeypoints};
 
 use super::Error;
@@ -26,6 +28,11 @@ const NEAR_RAD: f64 = 0.261_8;
 /// An answered pose is wrong beyond these meters or radians.
 const WRONG_M: f64 = 0.2;
 const WRONG_RAD: f64 = 0.174_5;
+/// Largest error of a predicted pose along each axis, meters, and about it, radians.
+const PREDICTION_M: f64 = 0.03;
+const PREDICTION_RAD: f64 = 0.034_9;
+/// Seed of the errors of predicted poses.
+const PREDICTION_SEED: u64 = 1;
 /// Number of blended frames.
 const BLENDED: usize = 3;
 
@@ -47,6 +54,9 @@ pub struct MatchedPart {
     pub n: usize,
     /// Matched views.
     pub ours: Answered,
+    /// Matched views that are looked for near a predicted pose, as while tracking: the true pose with a
+    /// drawn error of at most 0.03 m and 2° along each axis.
+    pub near_prediction: Answered,
     /// Matched views where they answer, elsewhere the most similar frame.
     pub ours_or_nearest: LocalizationErrors,
     /// The pose of the mapped frame with the most similar feature.
@@ -146,6 +156,7 @@ struct View {
     frame: FrameId,
     truth: Pose,
     located: Result<Located, NotLocated>,
+    near_prediction: Result<Located, NotLocated>,
     nearest: Pose,
     blend: Pose,
     is_near: bool,
@@ -253,18 +264,19 @@ fn located(
 ) -> View {
     let row = frame.row();
     let truth = recording.poses[row];
-    let begun = clock();
-    let located = room.locate(ViewKeypoints {
+    let view = ViewKeypoints {
         keypoints: &recording.keypoints[row],
         camera: &recording.camera,
-    });
+    };
+    let begun = clock();
+    let located = room.locate(view);
     let seconds = clock() - begun;
 
     let is_near = baselines.poses.iter().any(|pose| {
         let error = PoseError::between(&truth, pose);
         error.translation_m <= NEAR_M && error.rotation_rad <= NEAR_RAD
     });
-    let located = located.map(|found| {
+    let judged = |found: LocatedView| {
         let error = log(&found.pose.pose.inv_mul(&truth)).to_vector();
         let solved = found
             .pose
@@ -275,18 +287,28 @@ fn located(
             pose: found.pose.pose,
             squared_length: solved.unwrap_or(f64::INFINITY),
         }
-    });
+    };
 
     let (nearest, blend) = baselines.poses_of(row);
     View {
         frame,
         truth,
-        located,
+        located: located.map(judged),
+        near_prediction: room.locate_near(view, &predicted(&truth, row)).map(judged),
         nearest,
         blend,
         is_near,
         seconds,
     }
+}
+
+/// A pose with the error of a prediction.
+fn predicted(truth: &Pose, row: usize) -> Pose {
+    let mut rng = ChaCha8Rng::seed_from_u64(PREDICTION_SEED);
+    rng.set_stream(row as u64);
+    let mut draw = |most: f64| Vector3::from_fn(|_, _| rng.random_range(-most..=most));
+    let (linear, angular) = (draw(PREDICTION_M), draw(PREDICTION_RAD));
+    truth * exp(&Twist { linear, angular })
 }
 
 /// Poses of the mapped frames with the most similar features.
@@ -368,7 +390,8 @@ fn part_of(views: &[&View], peer: &BTreeMap<FrameId, Option<Pose>>) -> MatchedPa
 
     MatchedPart {
         n: views.len(),
-        ours: ours(views),
+        ours: ours(views, &|view| &view.located),
+        near_prediction: ours(views, &|view| &view.near_prediction),
         ours_or_nearest: errors_of(&|view| match &view.located {
             Ok(located) => located.pose,
             Err(_) => view.nearest,
@@ -380,10 +403,16 @@ fn part_of(views: &[&View], peer: &BTreeMap<FrameId, Option<Pose>>) -> MatchedPa
 }
 
 /// The answers of matched views.
-fn ours(views: &[&View]) -> Answered {
-    let located = || views.iter().filter_map(|view| view.located.as_ref().ok());
-    let squared_lengths: Vec<f64> = located().map(|located| located.squared_length).collect();
-    let errors: Vec<PoseError> = views.iter().filter_map(|view| view.our_error()).collect();
+fn ours(views: &[&View], of: &dyn Fn(&View) -> &Result<Located, NotLocated>) -> Answered {
+    let located = || {
+        views
+            .iter()
+            .filter_map(|view| Some((view, of(view).as_ref().ok()?)))
+    };
+    let squared_lengths: Vec<f64> = located().map(|(_, found)| found.squared_length).collect();
+    let errors: Vec<PoseError> = located()
+        .map(|(view, found)| view.error(&found.pose))
+        .collect();
     Answered {
         coverage: Some(coverage(&squared_lengths)),
         ..Answered::of(&errors, views.len())
@@ -409,7 +438,7 @@ fn comparison(views: &[&View], peer: &BTreeMap<FrameId, Option<Pose>>) -> Option
     (!asked.is_empty()).then(|| PeerComparison {
         n: asked.len(),
         peer: Answered::of(&errors, asked.len()),
-        ours: ours(&asked),
+        ours: ours(&asked, &|view| &view.located),
         both: PairedErrors::of(&both),
     })
 }

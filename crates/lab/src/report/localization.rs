@@ -36,42 +36,46 @@ pub fn matched_localization_table(found: &MatchedLocalization) -> String {
         "views | located by | answered | median m | 90 % m | median ° | 90 % ° | wrong | 68 % | 95 %",
     );
     for (name, part) in parts(found) {
-        let ours = &part.ours;
-        let shares = [ours.answered, ours.wrong];
-        let [answered, wrong] = shares.map(|share| format!("{share:.3}"));
-        let cover = ours.coverage.map_or([f64::NAN; 2], |coverage| {
-            [coverage.within_68, coverage.within_95]
-        });
-        let [c68, c95] = cover.map(|share| format!("{share:.2}"));
+        let scores = |ours: &Answered| {
+            let cover = ours.coverage.map_or([f64::NAN; 2], |coverage| {
+                [coverage.within_68, coverage.within_95]
+            });
+            let [answered, wrong] = [ours.answered, ours.wrong].map(|share| format!("{share:.3}"));
+            let [c68, c95] = cover.map(|share| format!("{share:.2}"));
+            [answered, wrong, c68, c95]
+        };
 
         let label = format!("{name} ({})", part.n);
-        let mut row = |method: &str, errors: &LocalizationErrors, scores: [&str; 4]| {
+        let mut row = |method: &str, errors: &LocalizationErrors, scores: [String; 4]| {
             let [answered, wrong, c68, c95] = scores;
             let cells = [
                 method.to_owned(),
-                answered.to_owned(),
+                answered,
                 interval(&errors.translation_m.median, 4),
                 format!("{:.4}", errors.translation_m.p90),
                 interval(&errors.rotation_deg.median, 2),
                 format!("{:.2}", errors.rotation_deg.p90),
-                wrong.to_owned(),
-                c68.to_owned(),
-                c95.to_owned(),
+                wrong,
+                c68,
+                c95,
             ];
             table.row(&label, cells);
         };
-        row(
-            "matched views",
-            &ours.errors,
-            [&answered, &wrong, &c68, &c95],
-        );
-        row("nearest frame", &part.nearest_frame, ["1.000", "", "", ""]);
-        row("blend of three", &part.blend, ["1.000", "", "", ""]);
+        let of_all = || ["1.000", "", "", ""].map(str::to_owned);
+        for (method, answers) in [
+            ("matched views", &part.ours),
+            ("the same near a prediction", &part.near_prediction),
+        ] {
+            row(method, &answers.errors, scores(answers));
+        }
+        row("nearest frame", &part.nearest_frame, of_all());
+        row("blend of three", &part.blend, of_all());
     }
 
     let peer = peer_table(found);
     format!(
         "{table}\n{peer}wrong: answers over 0.2 m or 10 degrees off; near the map: a mapped view within 0.25 m and 15 degrees; \
+         near a prediction: the true pose off by up to 0.03 m and 2 degrees along each axis; \
          RMSE of the answers {:.4} m; {:.1} ms to match a view",
         found.all.ours.rmse_m, found.match_ms
     )
@@ -167,7 +171,10 @@ pub fn motion_table(found: &MotionEvaluation) -> String {
             ("the adapter", found.ours),
             ("the adapter without its mean motion", found.without_mean),
             ("its mean motion alone", found.constant),
-            ("the two-view reader", two_view.map(|found| found.ours)),
+            (
+                "the matched keypoints of both views",
+                two_view.map(|found| found.ours),
+            ),
             ("no motion", Some(found.no_motion)),
         ],
     );
@@ -180,7 +187,7 @@ pub fn motion_table(found: &MotionEvaluation) -> String {
     };
 
     let mut text = format!(
-        "{table}\nthe two-view reader estimated {:.1} % of the motions",
+        "{table}\nmatched keypoints gave {:.1} % of the motions",
         100.0 * answered
     );
     if *answered > 0.0 {

@@ -151,8 +151,8 @@ impl Belief {
 
     /// Predicts the state some seconds later.
     ///
-    /// The velocity is the Ornstein–Uhlenbeck process of `prior`, the correlated error one with the
-    /// correlation time of the parameters.
+    /// The velocity is the Ornstein–Uhlenbeck process of `prior`. The correlated error decays over the
+    /// expected motion, by the correlation range of the parameters.
     pub fn step(&self, prior: &MotionPrior, seconds: f64, parameters: &FilterParameters) -> Step {
         self.step_with(prior, seconds, parameters, parameters.process_noise_factor)
     }
@@ -176,7 +176,10 @@ impl Belief {
         noise_factor: f64,
     ) -> Step {
         let drift = prior.over(&self.velocity, seconds);
-        let decay = (-seconds / parameters.correlation_time_s).exp();
+        let [range_m, range_rad] = parameters.correlation_range;
+        let expected = &drift.motion;
+        let ranges = expected.linear.norm() / range_m + expected.angular.norm() / range_rad;
+        let decay = (-ranges).exp();
 
         let mut transition = SMatrix::<f64, JOINT, STATE>::zeros();
         for axis in 0..6 {

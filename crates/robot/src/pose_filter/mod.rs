@@ -36,8 +36,9 @@ use seese3_core::room::{FrameId, Room};
 pub struct FilterParameters {
     /// Share of the variance of a located pose that is correlated from view to view, 0 to 1.
     pub correlated_share: f64,
-    /// Correlation time of that part, seconds.
-    pub correlation_time_s: f64,
+    /// Distance, meters, and angle, radians, over which that part decays by a factor e. It is the
+    /// error of the map points in view: a camera at rest does not average it out.
+    pub correlation_range: [f64; 2],
     /// Factor on the process noise of the motion prior: a person turns and stops more abruptly than
     /// a Gaussian process.
     pub process_noise_factor: f64,
@@ -55,9 +56,9 @@ pub struct FilterParameters {
     /// Time without a located view and without visual odometry after which a stream is DEGRADED,
     /// seconds.
     pub max_unlocated_s: f64,
-    /// Time without a located view after which a stream that visual odometry carries is DEGRADED,
-    /// seconds.
-    pub max_carried_s: f64,
+    /// Largest standard deviations of the position along any direction, meters, and of the rotation
+    /// about any axis, radians, while TRACKING.
+    pub max_deviation: [f64; 2],
     /// Independent noise of wheel odometry.
     pub wheel_noise: MotionNoise,
     /// Independent noise of visual odometry.
@@ -84,18 +85,19 @@ impl Default for FilterParameters {
     fn default() -> Self {
         Self {
             correlated_share: 0.7,
-            correlation_time_s: 0.3,
+            correlation_range: [0.15, 0.15],
             process_noise_factor: 2.0,
             // The 99 % quantile of χ² with six degrees of freedom, and four times that.
             gate: 16.81,
             outlier_gate: 67.24,
             views_to_agree: 2,
             max_candidate_s: 5.0,
-            max_unlocated_s: 0.35,
-            max_carried_s: 1.0,
+            max_unlocated_s: 0.1,
+            // Errors of 0.2 m and 10° are 2.6 standard deviations: rarer than 1 in 100.
+            max_deviation: [0.077, 0.067],
             wheel_noise: MotionNoise::WHEELS,
             visual_noise: MotionNoise::IMAGES,
-            visual_design_effect: 20.0,
+            visual_design_effect: 10.0,
             visual_scale_time_s: 10.0,
             disagreement_time_s: 1.0,
             max_speed: [10.0, 15.0],
@@ -273,7 +275,8 @@ impl PoseFilter {
             state.wheel_motion = state.wheel_motion.and(log(&motion));
         }
         // After a frame without a motion, the camera may be anywhere. An identical image has none.
-        state.is_carried &= motions.visual.is_some() || state.unchanged_frames > 0;
+        let has_no_motion = is_first || state.unchanged_frames > 0;
+        state.is_carried &= motions.visual.is_some() || has_no_motion;
         if state.is_carried {
             state.sight_ns = Some(frame.time_ns);
         }

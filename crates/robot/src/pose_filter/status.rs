@@ -82,11 +82,15 @@ impl PoseFilter {
                 "{agreement} on a place other than the current map pose"
             ));
         }
-        if !place.tells_a_place() {
+        let [most_m, most_rad] = parameters.max_deviation;
+        let deviations = [place.position_deviation_m(), place.rotation_deviation_rad()];
+        if deviations[0] > most_m || deviations[1] > most_rad {
             return Some(format!(
-                "the pose uncertainty is {:.2} m and {:.0}° (2.5 standard deviations)",
-                2.5 * place.position_deviation_m(),
-                2.5 * place.rotation_deviation_rad().to_degrees()
+                "the standard deviations of the pose are {:.2} m and {:.1}°; at most {most_m:.2} m and {:.1}° \
+                 are trusted",
+                deviations[0],
+                deviations[1].to_degrees(),
+                most_rad.to_degrees()
             ));
         }
 

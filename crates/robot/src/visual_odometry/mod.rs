@@ -24,7 +24,7 @@ use crate::matched_views::{
     Correspondence, Search, ViewKeypoints, find_pose, pixel_focal, plane_points,
 };
 use adjustment::FrameMatch;
-use bundle::BundleLandmark;
+use bundle::{Bundle, BundleLandmark, Objective};
 use local_map::{Candidate, KeypointId, LocalMap};
 use seese3_core::geometry::{Pose, Twist, exp, log};
 use seese3_core::keypoints::Keypoints;
@@ -118,6 +118,12 @@ struct Tracked {
     covariance: Matrix6<f64>,
     /// Landmarks by keypoint.
     inliers: BTreeMap<usize, KeypointId>,
+}
+
+/// A frame, its last camera, with an adjusted pose.
+struct PosedFrame {
+    bundle: Bundle,
+    covariance: Matrix6<f64>,
 }
 
 impl VisualOdometry {
@@ -286,10 +292,10 @@ impl VisualOdometry {
             Reach::Near => *predicted,
             Reach::Wide => self.ransac(&matches, frame.focal_px)?,
         };
-        let mut bundle = self
+        let bundle = self
             .map
             .frame_bundle(&matches, start, frame.focal_px, parameters);
-        bundle.adjust_from_afar(parameters.adjustment_steps);
+        let PosedFrame { bundle, covariance } = self.posed(bundle, &matches)?;
 
         let is_inlier = |landmark: &BundleLandmark| {
             let [mean, deviation] = landmark.prior;
@@ -308,9 +314,49 @@ impl VisualOdometry {
         let pose = *bundle.poses.last()?;
         (inliers.len() >= parameters.min_inliers).then_some(Tracked {
             pose,
-            covariance: bundle.covariance()?,
+            covariance,
             inliers,
         })
+    }
+
+    /// Adjusts the pose of a frame: to the landmarks of known depth if they are enough, and then the
+    /// depths of the others to that pose; else to all landmarks.
+    ///
+    /// Landmarks of unknown depth are left out because their prior has independent deviations. True
+    /// depths deviate from it together, as those of a wall, and the adjustment would explain that by a
+    /// rotation.
+    fn posed(&self, mut bundle: Bundle, matches: &[FrameMatch]) -> Option<PosedFrame> {
+        let parameters = &self.parameters;
+        let is_known = |match_: &FrameMatch| {
+            let landmark = self.map.landmark(match_.anchor);
+            landmark.is_some_and(|landmark| landmark.is_known(parameters))
+        };
+        let known: Vec<BundleLandmark> = bundle
+            .landmarks
+            .iter()
+            .zip(matches)
+            .filter(|(_, match_)| is_known(match_))
+            .map(|(landmark, _)| landmark.clone())
+            .collect();
+        if known.len() < parameters.min_known_landmarks {
+            bundle.adjust_from_afar(parameters.adjustment_steps);
+            let covariance = bundle.covariance()?;
+            return Some(PosedFrame { bundle, covariance });
+        }
+
+        let mut by_known = Bundle {
+            landmarks: known,
+            objective: Objective::Joint,
+            ..bundle.clone()
+        };
+        by_known.adjust_from_afar(parameters.adjustment_steps);
+        let covariance = by_known.covariance()?;
+
+        bundle.poses = by_known.poses;
+        bundle.is_free.fill(false);
+        bundle.objective = Objective::Joint;
+        bundle.adjust(parameters.adjustment_steps);
+        Some(PosedFrame { bundle, covariance })
     }
 
     /// Pairs of a candidate and a keypoint that are each other's most similar one.

@@ -41,6 +41,8 @@ pub struct OdometryParameters {
     pub depth_deviations: [f64; 2],
     /// Relative standard deviation below which a landmark's inverse depth counts as known.
     pub known_depth_deviation: f64,
+    /// Minimum number of matched landmarks of known depth that determine the pose of a frame alone.
+    pub min_known_landmarks: usize,
     /// Smallest parallax of a landmark of unknown depth that an adjustment uses, pixels.
     pub min_parallax_px: f64,
     /// Number of frames in succession without a pose after which the local map begins anew.
@@ -82,6 +84,7 @@ impl Default for OdometryParameters {
             adjustment_steps: 6,
             depth_deviations: [1.0, 0.35],
             known_depth_deviation: 0.3,
+            min_known_landmarks: 60,
             min_parallax_px: 4.0,
             max_lost_frames: 10,
             scale_deviations: ScaleDeviations {

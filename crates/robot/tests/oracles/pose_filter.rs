@@ -1,6 +1,6 @@
 //! The filter of located poses.
 
-use nalgebra::{Matrix6, Vector3};
+use nalgebra::{Matrix6, Vector3, Vector6};
 
 use seese3_core::geometry::{Pose, PoseError, Twist, body_twist, exp};
 use seese3_core::room::FrameId;
@@ -14,10 +14,10 @@ use seese3_robot::visual_odometry::VisualMotion;
 
 const PERIOD_NS: i64 = 33_333_333;
 
-fn parameters(correlated_share: f64, correlation_time_s: f64) -> FilterParameters {
+fn parameters(correlated_share: f64, correlation_range: f64) -> FilterParameters {
     FilterParameters {
         correlated_share,
-        correlation_time_s,
+        correlation_range: [correlation_range; 2],
         ..FilterParameters::default()
     }
 }
@@ -86,6 +86,29 @@ fn correlated_errors_are_not_averaged_out() {
     assert!((variance_after_two(1.0 - 1e-9) / 1e-4 - 1.0).abs() < 1e-6);
     // A half that lasts and a half that is averaged.
     assert!((variance_after_two(0.5) / 0.75e-4 - 1.0).abs() < 1e-9);
+}
+
+/// Oracle: the definition of the correlation range. Over this distance, the correlated error decays by
+/// a factor e; at rest it stays.
+#[test]
+fn correlated_errors_decay_over_the_distance() {
+    let prior = MotionPrior::assumed();
+    let parameters = parameters(0.7, 0.2);
+    let left = |speed: f64| {
+        let mut belief = Belief::at(&located(Pose::identity(), 0.01), &prior, 0.7);
+        belief.correlated_error = Vector6::repeat(1.0);
+        belief.velocity.linear.x = speed;
+        belief
+            .step(&prior, 0.001, &parameters)
+            .end()
+            .correlated_error[0]
+    };
+    assert!((left(0.0) - 1.0).abs() < 1e-12);
+    assert!(
+        (left(200.0) - (-1.0_f64).exp()).abs() < 0.01,
+        "{}",
+        left(200.0)
+    );
 }
 
 /// Oracle: the same definition. A correlated error is that of both ends of a motion, so it cancels.
