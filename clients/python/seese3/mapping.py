@@ -3,8 +3,8 @@
     python -m seese3.mapping walk.mp4 --room kitchen --store store --out kitchen-map \\
         --distance frame_000000.jpg frame_000090.jpg 1.5
 
-It needs the extra: `pip install "seese3[mapping]"`. Every step writes into the output folder; the same command goes on
-after the last complete step. The steps:
+It needs the extra: `pip install "seese3[mapping]"`. Run the same command again to resume after the last completed step.
+The steps:
 
 1. A video becomes images, a few a second. A folder of photographs is used as it is.
 2. SIFT features, and matches between images that follow each other; between all of them if they are few.
@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -65,7 +66,10 @@ class KnownPositions:
 
 @dataclass(frozen=True)
 class Wheels:
-    """A file of wheel odometry in TUM's form, `SECONDS X Y Z QX QY QZ QW`, on the clock of the images, meters."""
+    """A file of odometry of the camera in TUM's form, `SECONDS X Y Z QX QY QZ QW`, on the clock of the images, meters.
+
+    Poses of the base have a wrong length where the robot turns.
+    """
 
     file: Path
 
@@ -113,13 +117,16 @@ def map_room(
 ) -> Mapped:
     """Makes a room of a video, or of a folder of photographs in the order of their names.
 
-    `images_per_s` are taken from a video. `rate_hz` is the rate of photographs, whose names end in their numbers;
-    without it they have no times. `options` are passed on to `seese3 import colmap`.
+    `images_per_s` are taken from a video, whose rate has to be constant. `rate_hz` is the rate of the numbers in the
+    names of photographs: the time is the last number over the rate. Without it they have no
+    times. `options` are passed on to `seese3 import colmap`.
 
     Raises a `SeeseError` if too few images get a pose, or if the scale cannot be found.
     """
     pycolmap = _library("pycolmap")
     source, out = Path(source), Path(out)
+    if out.exists() and not out.is_dir():
+        raise SeeseError(f"{out} is a file: give a folder")
     out.mkdir(parents=True, exist_ok=True)
     # Its progress goes to a file: a thousand lines for a hundred images.
     pycolmap.logging.set_log_destination(pycolmap.logging.INFO, str(out / "colmap-"))
@@ -138,6 +145,11 @@ def map_room(
         names = sorted(times)
     if len(names) < 3:
         raise SeeseError(f"{source} has {len(names)} images; a map needs at least 3, and better 50")
+    if source.is_dir() and len(names) > MAX_EXHAUSTIVE and names != sorted(names, key=_natural):
+        raise SeeseError(
+            f"the photographs of {source} are not in the order of their names, such as 10.jpg before 2.jpg: write the "
+            "numbers with leading zeros"
+        )
     _say(f"   {len(names)} images in {images}")
 
     model = _model(pycolmap, images, names, out)
@@ -194,9 +206,9 @@ def _video_images(video: Path, images: Path, images_per_s: float) -> dict[str, f
     listed = images.parent / "images.json"
     made_with = {"video": str(video.resolve()), "bytes": _size(video), "images_per_s": images_per_s}
     if listed.exists():
-        found = json.loads(listed.read_text())
+        found = _loaded(listed)
         if found["made_with"] != made_with:
-            raise SeeseError(f"{images} has images of another video or rate: give another output folder, or remove it")
+            raise SeeseError(f"{images.parent} has images of another video or rate: give another output folder")
         return {str(name): float(time) for name, time in found["times"].items()}
 
     cv2 = _library("cv2")
@@ -213,12 +225,33 @@ def _video_images(video: Path, images: Path, images_per_s: float) -> dict[str, f
             is_read, image = opened.retrieve()
             if is_read:
                 name = f"frame_{number:06d}.jpg"
-                cv2.imwrite(str(images / name), image, [cv2.IMWRITE_JPEG_QUALITY, 95])
+                if not cv2.imwrite(str(images / name), image, [cv2.IMWRITE_JPEG_QUALITY, 95]):
+                    raise SeeseError(f"{images / name} cannot be written")
                 times[name] = number / rate
         number += 1
     opened.release()
-    listed.write_text(json.dumps({"made_with": made_with, "times": times}, indent=1))
+    _store(listed, {"made_with": made_with, "times": times})
     return times
+
+
+def _loaded(file: Path) -> Any:
+    try:
+        return json.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise SeeseError(f"{file} is damaged: give another output folder") from error
+
+
+def _store(file: Path, content: object) -> None:
+    """Writes a file as a whole, or not at all."""
+    written = file.with_suffix(".part")
+    written.write_text(json.dumps(content, indent=1))
+    written.replace(file)
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """Key of a name by which 2 comes before 10."""
+    parts = re.findall(r"\d+|\D+", name)
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
 
 
 def _size(file: Path) -> int:
@@ -233,18 +266,28 @@ def _model(pycolmap: Any, images: Path, names: list[str], out: Path) -> Any:
     database = out / "database.db"
     sparse = out / "sparse"
     done = out / "sparse.json"
-    if done.exists():
-        found = json.loads(done.read_text())
-        if found["names"] != names:
-            raise SeeseError(f"{out} has a model of other images: give another output folder, or remove it")
+    begun = out / "matched.json"
+    made_of = {"images": str(images.resolve()), "bytes": {name: _size(images / name) for name in names}}
+    if begun.exists():
+        if _loaded(begun) != made_of:
+            raise SeeseError(f"{out} has features of other images: give another output folder")
+    else:
+        if database.exists():
+            raise SeeseError(f"{database} is not of this command: give another output folder")
+        _store(begun, made_of)
+    if done.exists() and (sparse / str(_loaded(done)["largest"])).is_dir():
         _say("2., 3. the model is there")
-        return pycolmap.Reconstruction(str(sparse / str(found["largest"])))
+        return pycolmap.Reconstruction(str(sparse / str(_loaded(done)["largest"])))
 
     _say("2. features and matches")
     reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
     for begin in range(0, len(names), SHOWN_EVERY):
-        if database.exists() and begin > 0:
-            reader.existing_camera_id = 1
+        # All images are of one camera, also of an earlier, interrupted run.
+        if database.exists():
+            with pycolmap.Database.open(database) as opened:
+                cameras = opened.read_all_cameras()
+            if cameras:
+                reader.existing_camera_id = cameras[0].camera_id
         pycolmap.extract_features(
             database,
             images,
@@ -275,7 +318,7 @@ def _model(pycolmap: Any, images: Path, names: list[str], out: Path) -> Any:
     largest = max(models, key=lambda number: models[number].num_reg_images())
     if len(models) > 1:
         _say(f"   {len(models)} models were made; the one with the most images is used")
-    done.write_text(json.dumps({"names": names, "largest": largest}))
+    _store(done, {"largest": largest})
     return models[largest]
 
 
@@ -290,10 +333,12 @@ def _scaled(
             given = np.stack([position for _, position in named])
             found = np.stack([centers[name] for name, _ in named])
             if np.linalg.matrix_rank(given - given.mean(axis=0), tol=0.05) < 2:
-                raise SeeseError(f"the positions of {file} are nearly on a line: they leave a rotation open")
+                raise SeeseError(
+                    f"the positions of {file} are nearly on a line: the rotation about that line is undetermined"
+                )
             world_from_model = pycolmap.estimate_sim3d(found, given)
             if world_from_model is None:
-                raise SeeseError(f"no similarity takes the model to the positions of {file}")
+                raise SeeseError(f"no similarity transform aligns the model with the positions of {file}")
             moved = np.stack([world_from_model * center for center in found])
             deviation = float(np.sqrt(np.mean(np.sum((moved - given) ** 2, axis=1))))
             _say(f"   {len(named)} known positions are {deviation:.3f} m off (root mean square)")
@@ -315,7 +360,7 @@ def _scaled(
 
 def _center(centers: dict[str, Floats], name: str) -> Floats:
     if name not in centers:
-        raise SeeseError(f"{name} is no image with a pose; those are {_some(centers)}")
+        raise SeeseError(f"{name} has no pose; images with a pose: {_some(centers)}")
     return centers[name]
 
 
@@ -350,8 +395,8 @@ def _wheel_factor(file: Path, centers: dict[str, Floats], times: dict[str, float
     order = sorted((name for name in centers if stamps[0] <= times[name] <= stamps[-1]), key=lambda name: times[name])
     if len(order) < 2:
         raise SeeseError(
-            f"no images are within the times of {file}, {stamps[0]:.1f} to {stamps[-1]:.1f} s; those of the images are "
-            f"{min(times.values()):.1f} to {max(times.values()):.1f} s"
+            f"fewer than 2 images lie in the time range of {file}, {stamps[0]:.1f} to {stamps[-1]:.1f} s; the images "
+            f"are of {min(times.values()):.1f} to {max(times.values()):.1f} s"
         )
     at = np.array([times[name] for name in order])
     driven = np.stack([np.interp(at, stamps, path[:, axis]) for axis in range(3)], axis=1)
@@ -367,7 +412,7 @@ def _wheel_factor(file: Path, centers: dict[str, Floats], times: dict[str, float
             begin = end
     if len(ratios) < LEAST_WHEEL_PAIRS:
         raise SeeseError(
-            f"the wheels of {file} drove {len(ratios)} steps of {LEAST_WHEEL_STEP_M} m between images; at least "
+            f"only {len(ratios)} image pairs are {LEAST_WHEEL_STEP_M} m apart by the wheels of {file}; at least "
             f"{LEAST_WHEEL_PAIRS} are needed"
         )
     logarithms = np.log(ratios)
@@ -382,6 +427,8 @@ def _rows(file: Path, columns: int) -> list[tuple[int, list[str]]]:
         text = file.read_text()
     except OSError as error:
         raise SeeseError(f"{file}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise SeeseError(f"{file} is not a text file in UTF-8") from error
     rows = []
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.split()
@@ -420,7 +467,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--store", required=True, help="the store")
     parser.add_argument("--out", required=True, type=Path, help="folder of the images, matches and model; kept")
     parser.add_argument("--images-per-second", type=float, default=3.0, help="images taken from a video; %(default)s")
-    parser.add_argument("--rate", type=float, help="photographs per second, by the numbers in their names")
+    parser.add_argument(
+        "--rate", type=float, help="rate of the numbers in the names of photographs: time = last number / rate, seconds"
+    )
     scales = parser.add_mutually_exclusive_group(required=True)
     scales.add_argument(
         "--distance", nargs=3, metavar=("IMAGE", "IMAGE", "METERS"), help="distance between two camera positions"

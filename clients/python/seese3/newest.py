@@ -18,8 +18,8 @@ class Newest(Generic[T]):
             ...
 
     An item that a newer one replaces before it is asked for is dropped, and counted in `dropped`. The last item is
-    always returned. An exception of the source is raised here, after the last item. The thread is a daemon thread, and
-    ends with the source.
+    always returned. An exception of the source is raised here, after the last item. The thread is a daemon thread. It
+    ends with the source, or at its next item after `close`.
     """
 
     def __init__(self, source: Iterable[T]) -> None:
@@ -34,6 +34,8 @@ class Newest(Generic[T]):
         try:
             for item in source:
                 with self._changed:
+                    if self._is_over:
+                        return
                     self.dropped += len(self._waiting)
                     self._waiting[:] = [item]
                     self._changed.notify()
@@ -43,6 +45,13 @@ class Newest(Generic[T]):
             with self._changed:
                 self._is_over = True
                 self._changed.notify()
+
+    def close(self) -> None:
+        """Ends the iteration, and the reading at the next item of the source."""
+        with self._changed:
+            self._is_over = True
+            self._waiting.clear()
+            self._changed.notify()
 
     def __iter__(self) -> Iterator[T]:
         return self
@@ -58,7 +67,7 @@ class Newest(Generic[T]):
 
 
 class AsyncNewest(Generic[T]):
-    """The same for the asynchronous client. A task reads the source; `aclose` cancels it."""
+    """Asynchronous counterpart of `Newest`. A task reads the source; `aclose` cancels it."""
 
     def __init__(self, source: AsyncIterable[T]) -> None:
         self.dropped = 0
@@ -78,9 +87,12 @@ class AsyncNewest(Generic[T]):
             self._changed.set()
 
     async def aclose(self) -> None:
-        """Ends the reading."""
+        """Ends the reading and the iteration."""
         self._task.cancel()
         await asyncio.gather(self._task, return_exceptions=True)
+        self._waiting.clear()
+        self._is_over = True
+        self._changed.set()
 
     def __aiter__(self) -> AsyncIterator[T]:
         return self
@@ -88,8 +100,9 @@ class AsyncNewest(Generic[T]):
     async def __anext__(self) -> T:
         while not self._waiting:
             if self._is_over:
-                # Raises the exception of the source.
-                await self._task
+                if not self._task.cancelled():
+                    # Raises the exception of the source.
+                    await self._task
                 raise StopAsyncIteration
             await self._changed.wait()
             self._changed.clear()

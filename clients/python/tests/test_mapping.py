@@ -71,6 +71,16 @@ def test_a_video_becomes_a_room(filmed: tuple[Path, np.ndarray], tmp_path: Path)
 
     with pytest.raises(seese3.SeeseError, match="another video or rate"):
         mapping.map_room(video, room="x", store=store, out=out, scale=mapping.Factor(1.0), images_per_s=5.0)
+    other = tmp_path / "other"
+    other.mkdir()
+    for name in room.names:
+        (other / name).write_bytes((out / "images" / name).read_bytes() + b" ")
+    with pytest.raises(seese3.SeeseError, match="features of other images"):
+        mapping.map_room(other, room="x", store=store, out=out, scale=mapping.Factor(1.0))
+
+
+def test_two_comes_before_ten() -> None:
+    assert sorted(["10.jpg", "a/2.jpg", "2.jpg"], key=mapping._natural) == ["2.jpg", "10.jpg", "a/2.jpg"]
 
 
 def test_what_cannot_be_mapped_is_refused(tmp_path: Path) -> None:
@@ -112,7 +122,7 @@ def test_wheels_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     refused("1 2 3\n", "line 1: has 3 columns")
     refused("0 0 0 0 0 0 0 x\n1 0 0 0 0 0 0 1\n", "'x' is not a number")
     refused("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "do not increase")
-    refused("100 0 0 0 0 0 0 1\n101 1 0 0 0 0 0 1\n", "no images are within")
-    refused("".join(f"{0.1 * n:.1f} 0 0 0 0 0 0 1\n" for n in range(20)), "drove 0 steps")
+    refused("100 0 0 0 0 0 0 1\n101 1 0 0 0 0 0 1\n", "fewer than 2 images")
+    refused("".join(f"{0.1 * n:.1f} 0 0 0 0 0 0 1\n" for n in range(20)), "only 0 image pairs")
     with pytest.raises(seese3.SeeseError, match="needs the times"):
         mapping._wheel_factor(file, centers, {})

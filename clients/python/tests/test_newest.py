@@ -47,6 +47,13 @@ def test_an_error_of_the_source_comes_after_the_last_item() -> None:
             next(newest)
 
 
+def test_a_closed_one_ends() -> None:
+    newest = seese3.Newest(camera())
+    assert next(newest) >= 0
+    newest.close()
+    assert list(newest) == []
+
+
 def test_every_item_of_a_slow_source_is_seen() -> None:
     released = threading.Semaphore(0)
 
@@ -85,5 +92,9 @@ def test_the_asynchronous_one_is_alike() -> None:
         endless = seese3.AsyncNewest(source(10**9))
         assert await anext(endless) >= 0
         await endless.aclose()
+        assert [number async for number in endless] == []
+        unstarted = seese3.AsyncNewest(source(10**9))
+        await unstarted.aclose()
+        assert [number async for number in unstarted] == []
 
     asyncio.run(read())

@@ -49,12 +49,11 @@ impl<T: Send + 'static> Newest<T> {
             is_over: false,
             waker: None,
         }));
-        let to = Arc::clone(&shared);
+        let to = End(Arc::clone(&shared));
         let reader = tokio::spawn(async move {
             while let Some(item) = source.next().await {
-                locked(&to).put(item);
+                locked(&to.0).put(item);
             }
-            locked(&to).end();
         });
         Self { shared, reader }
     }
@@ -62,6 +61,15 @@ impl<T: Send + 'static> Newest<T> {
     /// Number of items that were dropped.
     pub fn dropped(&self) -> u64 {
         locked(&self.shared).dropped
+    }
+}
+
+/// Ends the items when it is dropped, also if the source panics.
+struct End<T>(Arc<Mutex<Shared<T>>>);
+
+impl<T> Drop for End<T> {
+    fn drop(&mut self) {
+        locked(&self.0).end();
     }
 }
 

@@ -72,19 +72,6 @@ impl Pooling {
         }
     }
 
-    /// Channels, rows and columns of a feature of `width` numbers, if it is a grid.
-    pub fn map_shape(self, width: usize) -> Option<[usize; 3]> {
-        match self {
-            Self::Grid { columns, rows, .. } => {
-                let cells = columns * rows;
-                width
-                    .is_multiple_of(cells)
-                    .then(|| [width / cells, rows, columns])
-            }
-            Self::Vector | Self::Cls | Self::Mean { .. } => None,
-        }
-    }
-
     /// Its text without the number of skipped tokens, for the names of features.
     pub(super) fn short(self) -> String {
         self.after(0).to_string()

@@ -220,7 +220,7 @@ fn adapter_without_room<'a>(
         count => {
             let problem = format!(
                 "is required when no room is named: the server has {count} adapters; two images with `camera` need \
-                 none if the server detects keypoints"
+                 none if the server has the --encoder of a room's keypoints"
             );
             Err(Error::invalid("adapter", problem))
         }

@@ -185,7 +185,8 @@ fn times_by_name(file: &Path) -> Result<BTreeMap<String, i64>, Error> {
         let named = row.trim().split_once(char::is_whitespace);
         let parsed = named.and_then(|(seconds, name)| Some((nanoseconds(seconds)?, name.trim())));
         let (time_ns, name) = parsed.ok_or_else(|| {
-            let problem = "is not SECONDS NAME, with the name of an image of the model";
+            let problem = "is not SECONDS NAME: non-negative decimal seconds without an exponent, and the name of an image \
+                           of the model";
             wrong(file, line, problem.into())
         })?;
         if times.insert(name.to_owned(), time_ns).is_some() {

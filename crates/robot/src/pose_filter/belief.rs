@@ -152,7 +152,7 @@ impl Belief {
     /// Predicts the state some seconds later.
     ///
     /// The velocity is the Ornstein–Uhlenbeck process of `prior`. The correlated error decays over the
-    /// expected motion, by the correlation range of the parameters.
+    /// motion that the velocity predicts, by the correlation range of the parameters.
     pub fn step(&self, prior: &MotionPrior, seconds: f64, parameters: &FilterParameters) -> Step {
         self.step_with(prior, seconds, parameters, parameters.process_noise_factor)
     }

@@ -274,7 +274,8 @@ impl PoseFilter {
         if let Some((motion, _)) = motions.wheels {
             state.wheel_motion = state.wheel_motion.and(log(&motion));
         }
-        // After a frame without a motion, the camera may be anywhere. An identical image has none.
+        // After a frame without a motion, the camera may be anywhere. The first image, or an identical
+        // one, has no motion to measure.
         let has_no_motion = is_first || state.unchanged_frames > 0;
         state.is_carried &= motions.visual.is_some() || has_no_motion;
         if state.is_carried {

@@ -319,8 +319,8 @@ impl VisualOdometry {
         })
     }
 
-    /// Adjusts the pose of a frame: to the landmarks of known depth if they are enough, and then the
-    /// depths of the others to that pose; else to all landmarks.
+    /// Estimates the pose of a frame from the landmarks of known depth if there are at least
+    /// `min_known_landmarks`, then fits the other depths to it. Otherwise uses all landmarks.
     ///
     /// Landmarks of unknown depth are left out because their prior has independent deviations. True
     /// depths deviate from it together, as those of a wall, and the adjustment would explain that by a

@@ -41,7 +41,7 @@ pub struct OdometryParameters {
     pub depth_deviations: [f64; 2],
     /// Relative standard deviation below which a landmark's inverse depth counts as known.
     pub known_depth_deviation: f64,
-    /// Minimum number of matched landmarks of known depth that determine the pose of a frame alone.
+    /// Minimum number of matched landmarks of known depth for a pose that is estimated from them alone.
     pub min_known_landmarks: usize,
     /// Smallest parallax of a landmark of unknown depth that an adjustment uses, pixels.
     pub min_parallax_px: f64,
