@@ -4,7 +4,7 @@
 //! keypoints, see [`crate::matched_views`].
 //!
 //! - The filter is stateless: all data of a stream are in its [`FilterState`].
-//! - The error of a located pose is the sum of a time-correlated part and white noise; see [`Belief`].
+//! - The error of a located pose is the sum of a correlated part and white noise; see [`Belief`].
 //!   The filter does not average the correlated part out.
 //! - A located pose that contradicts the belief is not used. Two in a row that agree replace it.
 //! - Measured motions (visual odometry, wheels) replace the motion prior, which smooths the velocity.

@@ -259,9 +259,8 @@ fn visual(number: u64) -> VisualMotion {
     }
 }
 
-/// Oracle: the true path. Visual odometry carries the pose where no view is located: the stream is
-/// TRACKING for one second. Without it, or after a frame without a motion, the stream is soon
-/// DEGRADED.
+/// Oracle: the true path. Visual odometry carries the pose where no view is located, and the stream
+/// stays TRACKING. Without it, or after a frame without a motion, the stream is soon DEGRADED.
 #[test]
 fn visual_odometry_carries_the_pose() {
     let filter = filter();
@@ -291,6 +290,62 @@ fn visual_odometry_carries_the_pose() {
         } else {
             assert_eq!(update.status, Status::Degraded, "{}", update.reason);
         }
+    }
+}
+
+/// Oracle: the definition of TRACKING by the largest standard deviations. A carried pose loses it in
+/// the frame in which its own covariance exceeds them, not at a fixed time.
+#[test]
+fn a_carried_pose_is_tracking_while_it_is_certain() {
+    let filter = filter();
+    let [most_m, most_rad] = filter.parameters().max_deviation;
+    let mut state = filter.start(None);
+    let mut seen = [false; 2];
+    for number in 1..=900 {
+        let observed = ViewObservation {
+            visual: (number > 1).then(|| visual(number)),
+            ..view(number, (number <= 30).then(|| path(number)))
+        };
+        let update = filter.observe(&mut state, &observed).unwrap();
+        if number <= 30 {
+            continue;
+        }
+
+        let pose = update.map_pose.unwrap();
+        let is_certain =
+            pose.position_deviation_m() <= most_m && pose.rotation_deviation_rad() <= most_rad;
+        assert_eq!(
+            update.status == Status::Tracking,
+            is_certain,
+            "{number}: {}",
+            update.reason
+        );
+        seen[usize::from(is_certain)] = true;
+    }
+    assert_eq!(seen, [true, true]);
+}
+
+/// Oracle: the contract. A pose that the client sets before the first frame counts as located there.
+/// Without fusion, visual odometry carries it.
+#[test]
+fn visual_odometry_carries_a_set_pose_without_fusion() {
+    let room = FilterRoom {
+        motion_prior: MotionPrior::assumed(),
+        extent_m: 3.0,
+    };
+    let parameters = FilterParameters {
+        fuse: false,
+        ..FilterParameters::default()
+    };
+    let filter = PoseFilter::new(vec![room], parameters).unwrap();
+    let mut state = filter.start(Some(&located(path(1), 1e-3)));
+    for number in 1..=30 {
+        let observed = ViewObservation {
+            visual: (number > 1).then(|| visual(number)),
+            ..view(number, None)
+        };
+        let update = filter.observe(&mut state, &observed).unwrap();
+        assert_eq!(update.status, Status::Tracking, "{}", update.reason);
     }
 }
 
