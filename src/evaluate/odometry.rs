@@ -6,19 +6,17 @@ use std::sync::{Mutex, PoisonError};
 
 use anyhow::Context;
 use clap::Args;
+use rayon::prelude::*;
 
 use seese3_core::splits::HoldOut;
-use seese3_core::training::RoomData;
-use seese3_lab::experiments::keypoint_odometry::{self, KeypointRecording};
-use seese3_lab::experiments::odometry::{
-    OdometryProtocol, Relocalisation, RoomOdometry, evaluate, relocalisation, trackers,
-};
+use seese3_lab::experiments::odometry::{Relocalisation, RoomOdometry, evaluate, relocalisation};
+use seese3_lab::experiments::replay::Replay;
+use seese3_lab::experiments::tracked_room::{KeypointRecording, TrackedRoom, TrackingProtocol};
 use seese3_lab::report::{
     APE_FORMULA, coverage_table, odometry_json, odometry_table, other_rooms_text,
     relocalisation_text, scenarios_text,
 };
 use seese3_robot::pose_filter::FilterParameters;
-use seese3_robot::tracking::{Replay, TrackerSettings};
 
 use super::super::named::one_of;
 use super::super::output::{JsonOutput, say, write_file};
@@ -44,7 +42,7 @@ pub struct Odometry {
     /// Which frames are mapped and which are replayed
     #[arg(long, value_parser = one_of::<HoldOut>(), default_value = "blocks")]
     hold_out: HoldOut,
-    /// Keyframe interval, frames; derived from the adapter's training if omitted
+    /// Interval of the keyframes of reported motions, frames; 30 if omitted
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     keyframe_frames: Option<u32>,
     /// Dead reckoning only: no corrections from the map
@@ -87,20 +85,15 @@ impl Odometry {
         say_leaks(&rooms, &stored.record);
 
         let adapter = stored.adapter;
-        let hold_out = self.hold_out;
-        let settings = self.settings(TrackerSettings::of(&adapter));
-        let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
-        let protocol = OdometryProtocol {
-            hold_out,
-            settings,
-            is_fitted: self.fit,
-        };
-        let trackers = trackers(&room_data, &adapter, &protocol)?;
-        let tracked = self.tracked(trackers.len(), |done| evaluate(&trackers, hold_out, done))?;
+        let rooms: Vec<TrackedRoom<'_>> = rooms
+            .iter()
+            .map(|room| TrackedRoom::by_adapter(&data(room), &adapter, &self.protocol()))
+            .collect::<Result<_, _>>()?;
+        let tracked = self.tracked(rooms.len(), |done| evaluate(&rooms, done))?;
 
         // Relocalization needs at least two rooms to choose from.
-        let relocalised = (trackers.len() > 1)
-            .then(|| relocalisation(&trackers, hold_out))
+        let relocalised = (rooms.len() > 1)
+            .then(|| relocalisation(&rooms))
             .transpose()?;
 
         let what = format!("adapter '{}' revision {}", stored.name, stored.revision);
@@ -133,16 +126,15 @@ impl Odometry {
             })
             .collect();
 
-        let default = FilterParameters::default();
-        let parameters = FilterParameters {
-            keyframe_frames: self.keyframe_frames.unwrap_or(default.keyframe_frames),
-            fuse: !self.no_fusion,
-            ..default
-        };
         let pool = self.views.runtime.pool()?;
         let tracked = self.tracked(rooms.len(), |done| {
             pool.install(|| {
-                keypoint_odometry::evaluate(&recordings, self.hold_out, parameters, done)
+                let protocol = self.protocol();
+                let rooms: Vec<TrackedRoom<'_>> = recordings
+                    .par_iter()
+                    .map(|recording| TrackedRoom::by_keypoints(recording, &protocol))
+                    .collect::<Result<_, _>>()?;
+                evaluate(&rooms, done)
             })
         })?;
         let how = if self.no_fusion {
@@ -219,12 +211,16 @@ impl Odometry {
         self.json.write(&odometry_json(tracked, relocalised))
     }
 
-    /// The adapter's settings, overridden by the given options.
-    fn settings(&self, own: TrackerSettings) -> TrackerSettings {
-        TrackerSettings {
-            keyframe_frames: self.keyframe_frames.unwrap_or(own.keyframe_frames),
-            fuse: !self.no_fusion,
-            ..own
+    fn protocol(&self) -> TrackingProtocol {
+        let default = FilterParameters::default();
+        TrackingProtocol {
+            hold_out: self.hold_out,
+            parameters: FilterParameters {
+                keyframe_frames: self.keyframe_frames.unwrap_or(default.keyframe_frames),
+                fuse: !self.no_fusion,
+                ..default
+            },
+            is_fitted: self.fit,
         }
     }
 

@@ -9,16 +9,12 @@ use seese3_core::image::RgbImage;
 use seese3_core::keypoints::Keypoints;
 use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::HoldOut;
-use seese3_core::training::RoomData;
-use seese3_lab::experiments::keypoint_odometry::{
-    DisturbedKeypoints, DisturbedRoom, KeypointRecording,
-};
-use seese3_lab::experiments::odometry::{OdometryProtocol, trackers};
-use seese3_lab::experiments::robustness::{
-    Disturbance, DisturbedTracking, DisturbedViews, changed_images, evaluate,
+use seese3_lab::experiments::robustness::{Disturbance, DisturbedTracking, changed_images};
+use seese3_lab::experiments::tracked_room::{
+    DisturbedViews, KeypointRecording, TrackedRoom, TrackingProtocol,
 };
 use seese3_lab::report::{robustness_json, robustness_table};
-use seese3_robot::tracking::TrackerSettings;
+use seese3_robot::pose_filter::FilterParameters;
 
 use super::super::encode::images_root;
 use super::super::named::one_of;
@@ -78,13 +74,10 @@ impl Robustness {
         say_leaks(&rooms, &stored.record);
 
         let encoder = self.encoder_of(&source, encoder, adapter)?;
-        let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
-        let protocol = OdometryProtocol {
-            hold_out: self.hold_out,
-            settings: TrackerSettings::of(&stored.adapter),
-            is_fitted: false,
-        };
-        let trackers = trackers(&room_data, &stored.adapter, &protocol)?;
+        let trackers: Vec<TrackedRoom<'_>> = rooms
+            .iter()
+            .map(|room| TrackedRoom::by_adapter(&data(room), &stored.adapter, &self.protocol()))
+            .collect::<Result<_, _>>()?;
 
         let disturbances = self.disturbances()?;
         let steps = trackers.len() * disturbances.len();
@@ -118,8 +111,9 @@ impl Robustness {
                     let views = DisturbedViews {
                         features: features.view(),
                         is_blank: &is_blank,
+                        keypoints: &[],
                     };
-                    Ok(evaluate(tracker, self.hold_out, disturbance, views)?)
+                    Ok(tracker.track_disturbed(disturbance, views)?)
                 });
                 found.push(named(one, room, disturbance)?);
                 progress.inc(1);
@@ -152,7 +146,8 @@ impl Robustness {
                 keypoints: &encoded.keypoints,
                 camera: keypoints.map.camera,
             };
-            let mapped = pool.install(|| DisturbedRoom::new(&recording, self.hold_out))?;
+            let protocol = self.protocol();
+            let mapped = pool.install(|| TrackedRoom::by_keypoints(&recording, &protocol))?;
             let tracked = self.hold_out.tracked(room.timeline());
             let rows: Vec<usize> = tracked.iter().map(|frame| frame.row()).collect();
             let progress = bar(disturbances.len() as u64, "disturbing");
@@ -172,11 +167,12 @@ impl Robustness {
                         let detected = frame.keypoints.filter(|_| !blank);
                         keypoints[row] = detected.unwrap_or_default();
                     })?;
-                    let views = DisturbedKeypoints {
+                    let views = DisturbedViews {
                         features: features.view(),
+                        is_blank: &[],
                         keypoints: &keypoints,
                     };
-                    Ok(mapped.track(disturbance, views))
+                    Ok(mapped.track_disturbed(disturbance, views)?)
                 });
                 found.push(named(one, room, disturbance)?);
                 progress.inc(1);
@@ -200,6 +196,14 @@ impl Robustness {
         say(robustness_table(found));
         self.json
             .write(&robustness_json(found, adapter, self.hold_out))
+    }
+
+    fn protocol(&self) -> TrackingProtocol {
+        TrackingProtocol {
+            hold_out: self.hold_out,
+            parameters: FilterParameters::default(),
+            is_fitted: false,
+        }
     }
 
     /// The disturbances selected by `--only`.

@@ -263,7 +263,7 @@ impl Track {
             });
         }
 
-        // Anchors are mapped frames similar to the view; they correct the drift of dead reckoning.
+        // Located views correct the drift of dead reckoning.
         let fusion = if self.no_fusion {
             pb::Fusion::None
         } else {

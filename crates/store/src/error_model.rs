@@ -5,19 +5,16 @@ use ndarray::Array2;
 
 use super::Error;
 use super::tensors::{TensorReader, TensorWriter};
-use seese3_core::adapter::{ErrorModel, ErrorStatistics, ErrorTable, MotionErrors, Stratum};
+use seese3_core::adapter::{ErrorModel, ErrorStatistics, ErrorTable, Stratum};
 use seese3_robot::tracking::ASSUMED_PERIOD_S;
 
 const FRAME_NOISE: &str = "calibration.flicker";
-const MOTION_SPREAD: &str = "calibration.spread";
-/// One row per stratum: the number of frames between the two views, the gain, and the covariance on
-/// (v, ω), 36 entries in row-major order.
-const MOTIONS: &str = "calibration.motions";
-/// As [`MOTIONS`], but the first column is the match distance, whitened by the covariance of the
-/// frame noise.
-const ANCHORS: &str = "calibration.anchors";
-/// Five numbers, in this order: the floor u₀ of the motion errors, the out-of-distribution limit,
-/// the certain-match limit, the jump distance and the map-pose factor.
+/// One row per stratum: the match distance, whitened by the covariance of the frame noise, and the
+/// covariance on (v, ω), 36 entries in row-major order. Files of earlier versions have a gain in
+/// between.
+const MATCH_ERRORS: &str = "calibration.anchors";
+/// The out-of-distribution limit and the certain-match limit. Files of earlier versions have five
+/// numbers, with these two at the second and third place.
 const LIMITS: &str = "calibration.limits";
 /// Frame period, seconds. Absent in files of earlier versions, whose rooms were recorded at 30 Hz.
 const FRAME_PERIOD: &str = "calibration.period";
@@ -27,51 +24,34 @@ pub fn write(tensors: &mut TensorWriter, error_model: &ErrorModel) {
     let ErrorStatistics {
         frame_period_s,
         frame_noise,
-        motion_spread,
-        motion_errors,
-        anchor_errors,
+        match_errors,
         out_of_distribution_ratio,
         certain_match_ratio,
-        jump_distance,
-        map_pose_factor,
     } = error_model.statistics();
 
-    for (name, matrix) in [(FRAME_NOISE, frame_noise), (MOTION_SPREAD, motion_spread)] {
-        tensors.f64(
-            name,
-            &[matrix.nrows(), matrix.ncols()],
-            matrix.iter().copied(),
-        );
-    }
+    tensors.f64(
+        FRAME_NOISE,
+        &[frame_noise.nrows(), frame_noise.ncols()],
+        frame_noise.iter().copied(),
+    );
 
     // nalgebra iterates in column-major order; the transpose gives row-major entries.
     let row = |stratum: &Stratum| {
         let covariance: Vec<f64> = stratum.covariance.transpose().iter().copied().collect();
-        [stratum.at, stratum.gain].into_iter().chain(covariance)
+        std::iter::once(stratum.at).chain(covariance)
     };
 
-    for (name, table) in [(MOTIONS, &motion_errors.shapes), (ANCHORS, anchor_errors)] {
-        tensors.f64(
-            name,
-            &[table.strata().len(), 38],
-            table.strata().iter().flat_map(row),
-        );
-    }
-
+    tensors.f64(
+        MATCH_ERRORS,
+        &[match_errors.strata().len(), 37],
+        match_errors.strata().iter().flat_map(row),
+    );
     tensors.f64(FRAME_PERIOD, &[1], [*frame_period_s].into_iter());
 
-    // The order of the five numbers is part of the file format; `read` relies on it.
     tensors.f64(
         LIMITS,
-        &[5],
-        [
-            motion_errors.floor,
-            *out_of_distribution_ratio,
-            *certain_match_ratio,
-            *jump_distance,
-            *map_pose_factor,
-        ]
-        .into_iter(),
+        &[2],
+        [*out_of_distribution_ratio, *certain_match_ratio].into_iter(),
     );
 }
 
@@ -83,7 +63,14 @@ pub fn read(tensors: &TensorReader<'_>, file: &str) -> Result<Option<ErrorModel>
         return Ok(None);
     }
 
-    let limits = sized(tensors, LIMITS, Some(1), 5, file)?;
+    let limits = tensors.f64(LIMITS)?;
+    let limits = match limits.dim() {
+        (1, 2) => [limits[(0, 0)], limits[(0, 1)]],
+        _ => {
+            let limits = sized(tensors, LIMITS, Some(1), 5, file)?;
+            [limits[(0, 1)], limits[(0, 2)]]
+        }
+    };
 
     let frame_period_s = if tensors.has(FRAME_PERIOD) {
         sized(tensors, FRAME_PERIOD, Some(1), 1, file)?[(0, 0)]
@@ -91,34 +78,24 @@ pub fn read(tensors: &TensorReader<'_>, file: &str) -> Result<Option<ErrorModel>
         ASSUMED_PERIOD_S
     };
 
-    let stratum = |row: ndarray::ArrayView1<'_, f64>| Stratum {
-        at: row[0],
-        gain: row[1],
-        covariance: Matrix6::from_fn(|i, j| row[2 + 6 * i + j]),
-    };
-
     let damaged = |error: seese3_core::adapter::Error| Error::Damaged {
         file: file.to_owned(),
         problem: error.into(),
     };
-    let table = |name: &str| {
-        let rows = sized(tensors, name, None, 38, file)?;
-        ErrorTable::new(rows.outer_iter().map(stratum).collect()).map_err(damaged)
+    let rows = tensors.f64(MATCH_ERRORS)?;
+    let first = if rows.ncols() == 37 { 1 } else { 2 };
+    let rows = sized(tensors, MATCH_ERRORS, None, first + 36, file)?;
+    let stratum = |row: ndarray::ArrayView1<'_, f64>| Stratum {
+        at: row[0],
+        covariance: Matrix6::from_fn(|i, j| row[first + 6 * i + j]),
     };
 
     let statistics = ErrorStatistics {
         frame_period_s,
         frame_noise: tensors.f64(FRAME_NOISE)?,
-        motion_spread: tensors.f64(MOTION_SPREAD)?,
-        motion_errors: MotionErrors {
-            shapes: table(MOTIONS)?,
-            floor: limits[(0, 0)],
-        },
-        anchor_errors: table(ANCHORS)?,
-        out_of_distribution_ratio: limits[(0, 1)],
-        certain_match_ratio: limits[(0, 2)],
-        jump_distance: limits[(0, 3)],
-        map_pose_factor: limits[(0, 4)],
+        match_errors: ErrorTable::new(rows.outer_iter().map(stratum).collect()).map_err(damaged)?,
+        out_of_distribution_ratio: limits[0],
+        certain_match_ratio: limits[1],
     };
 
     ErrorModel::new(statistics).map(Some).map_err(damaged)

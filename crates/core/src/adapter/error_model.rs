@@ -1,22 +1,19 @@
 //! An adapter's error model: the size of its errors in rooms outside its training set. It is
-//! measured once, by the calibration in `seese3-robot`, and stored with the adapter. Tracking
-//! requires it.
+//! measured once, by the calibration in `seese3-robot`, and stored with the adapter. Tracking by
+//! latents requires it.
 //!
 //! Start reading at [`ErrorStatistics`], which lists all measured quantities.
 
 use nalgebra::{Cholesky, Matrix6};
-use ndarray::{Array2, ArrayView1};
+use ndarray::Array2;
 
 use super::{Error, Whitener};
 
 /// Rows to each side of a frame that count as its temporal neighbors. They are near it because
 /// little time has passed, not because the camera revisits a place.
 pub const TEMPORAL_NEIGHBOURS: u32 = 10;
-/// Number of previous frames that a view is compared with to detect a jump.
-pub const JUMP_WINDOW: usize = 5;
 
-/// Error covariances, tabulated by one predictor of their size: the distance of a match, or the
-/// number of frames of a motion.
+/// Error covariances, tabulated by one predictor of their size, the distance of a match.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ErrorTable {
     strata: Vec<Stratum>,
@@ -27,9 +24,6 @@ pub struct ErrorTable {
 pub struct Stratum {
     /// The value of the predictor, above 0.
     pub at: f64,
-    /// Shrinkage factor of an estimate, from 0 to 1: the slope of the regression of the true value
-    /// on the estimate.
-    pub gain: f64,
     /// Covariance of the errors on (v, ω), meters and radians; positive definite.
     pub covariance: Matrix6<f64>,
 }
@@ -41,7 +35,6 @@ impl Stratum {
 
         self.at.is_finite()
             && self.at > 0.0
-            && self.gain.is_finite()
             && is_symmetric
             && Cholesky::new(self.covariance).is_some()
     }
@@ -90,42 +83,9 @@ impl ErrorTable {
 
         Stratum {
             at,
-            gain: low.gain + share * (high.gain - low.gain),
             // A weighted mean of two positive definite matrices is positive definite.
             covariance: low.covariance * (1.0 - share) + high.covariance * share,
         }
-    }
-}
-
-/// Covariances of predicted motions, Σ = (u + u₀) S(n).
-///
-/// Σ grows linearly with u, the squared length of the difference of latents (fitted exponents are 1
-/// within a few hundredths). S depends on n, the number of frames of the motion: over few frames, u
-/// is mostly noise.
-#[derive(Debug, Clone, PartialEq)]
-pub struct MotionErrors {
-    /// S by the number of frames, 1 or more; on (v, ω), meters and radians.
-    pub shapes: ErrorTable,
-    /// u₀, above 0, in the unit of u. It keeps the covariance of a stationary camera above zero.
-    pub floor: f64,
-}
-
-impl MotionErrors {
-    /// Covariance of a motion over `frames` frames; `squared_length` is u, the squared length of
-    /// the difference of latents.
-    pub fn at(&self, squared_length: f64, frames: u64) -> Matrix6<f64> {
-        let shape = self.shapes.at(frames.max(1) as f64).covariance;
-        shape * (squared_length + self.floor)
-    }
-
-    /// Shrinkage factor of a predicted motion over `frames` frames.
-    pub fn gain(&self, frames: u64) -> f64 {
-        self.shapes.at(frames.max(1) as f64).gain
-    }
-
-    /// Covariance of a motion over the largest measured number of frames.
-    fn over_longest(&self, squared_length: f64) -> Matrix6<f64> {
-        self.shapes.at(f64::INFINITY).covariance * (squared_length + self.floor)
     }
 }
 
@@ -133,32 +93,19 @@ impl MotionErrors {
 #[derive(Debug, Clone, PartialEq)]
 pub struct ErrorStatistics {
     /// Frame period of the calibration rooms, seconds: the mean over rooms of the median period.
-    /// All frame counts below are multiples of it.
     pub frame_period_s: f64,
     /// Frame noise: half the second moment of the latent differences between successive frames,
     /// shape (c, c). It includes the camera's motion over one frame.
     pub frame_noise: Array2<f64>,
-    /// Motion spread: the second moment of latent differences over motions from one frame to the
-    /// longest trained stride, shape (c, c).
-    pub motion_spread: Array2<f64>,
-    /// Errors of predicted motions; u is measured in `motion_spread`.
-    pub motion_errors: MotionErrors,
     /// Errors of a pose estimated from a matched frame, by the distance of the match in
     /// `frame_noise`.
-    pub anchor_errors: ErrorTable,
+    pub match_errors: ErrorTable,
     /// Out-of-distribution limit of the match distance, as a multiple of the room's typical
     /// distance. Above it, the view counts as another place.
     pub out_of_distribution_ratio: f64,
     /// Limit of the match distance for a certain match, as a multiple of the room's typical
     /// distance. Hardly any frame of another room is below it.
     pub certain_match_ratio: f64,
-    /// Distance limit for jump detection, in `frame_noise`: a view farther than this from each of
-    /// the last [`JUMP_WINDOW`] frames is a jump. If the last frame is n frame periods old, the
-    /// limit is multiplied by ∛n.
-    pub jump_distance: f64,
-    /// Inflation factor of map poses: the reported covariance is the filter's times this factor,
-    /// plus the correlated part of the anchor errors.
-    pub map_pose_factor: f64,
 }
 
 /// A validated error model.
@@ -166,7 +113,6 @@ pub struct ErrorStatistics {
 pub struct ErrorModel {
     statistics: ErrorStatistics,
     frame_noise: Whitener,
-    motion_spread: Whitener,
 }
 
 impl ErrorModel {
@@ -176,23 +122,14 @@ impl ErrorModel {
     /// [`Error::ErrorModel`], which names the invalid quantity.
     pub fn new(statistics: ErrorStatistics) -> Result<Self, Error> {
         let frame_noise = Whitener::new(statistics.frame_noise.view())?;
-        let motion_spread = Whitener::new(statistics.motion_spread.view())?;
-        if frame_noise.size() != motion_spread.size() {
-            return Err(Error::ErrorModel {
-                what: "the size of a covariance of latents",
-            });
-        }
 
         let positive = [
             ("the frame period", statistics.frame_period_s),
-            ("the motion-error floor", statistics.motion_errors.floor),
-            ("the map-pose factor", statistics.map_pose_factor),
             (
                 "the out-of-distribution limit",
                 statistics.out_of_distribution_ratio,
             ),
             ("the certain-match limit", statistics.certain_match_ratio),
-            ("the jump distance", statistics.jump_distance),
         ];
         for (what, value) in positive {
             if !(value.is_finite() && value > 0.0) {
@@ -203,7 +140,6 @@ impl ErrorModel {
         Ok(Self {
             statistics,
             frame_noise,
-            motion_spread,
         })
     }
 
@@ -217,42 +153,9 @@ impl ErrorModel {
         &self.frame_noise
     }
 
-    /// Covariance of a motion over `frames` frames, predicted from a difference of latents, shape
-    /// (c,).
-    pub fn motion_errors(&self, difference: ArrayView1<'_, f64>, frames: u64) -> Matrix6<f64> {
-        self.statistics
-            .motion_errors
-            .at(self.motion_spread.squared_length(difference), frames)
-    }
-
-    /// Squared length u of a difference of latents, shape (c,), in the motion spread.
-    pub fn spread_length(&self, difference: ArrayView1<'_, f64>) -> f64 {
-        self.motion_spread.squared_length(difference)
-    }
-
-    /// Number of calibration frame periods in `seconds`, rounded; at least 1.
-    pub fn frames_in(&self, seconds: f64) -> u64 {
-        (seconds / self.statistics.frame_period_s).round().max(1.0) as u64
-    }
-
-    /// Largest number of frames for which motion errors were measured.
-    pub fn longest_frames(&self) -> f64 {
-        let strata = self.statistics.motion_errors.shapes.strata();
-        strata[strata.len() - 1].at
-    }
-
-    /// Covariance of an unknown motion within the trained range.
-    pub fn unread_errors(&self) -> Matrix6<f64> {
-        // Under its own second moment, a difference has the mean squared length c, its number of
-        // columns.
-        self.statistics
-            .motion_errors
-            .over_longest(self.motion_spread.size() as f64)
-    }
-
     /// Errors of a pose estimated from a match at `distance`, in frame noise.
-    pub fn anchor_errors(&self, distance: f64) -> Stratum {
-        self.statistics.anchor_errors.at(distance)
+    pub fn match_errors(&self, distance: f64) -> Stratum {
+        self.statistics.match_errors.at(distance)
     }
 }
 
@@ -263,7 +166,6 @@ mod tests {
     fn stratum(at: f64, variance: f64) -> Stratum {
         Stratum {
             at,
-            gain: at,
             covariance: Matrix6::from_diagonal_element(variance),
         }
     }

@@ -29,10 +29,7 @@ mod trained;
 mod whitener;
 
 pub use corrector::{Corrector, CorrectorKind, CorrectorSamples, train_corrector};
-pub use error_model::{
-    ErrorModel, ErrorStatistics, ErrorTable, JUMP_WINDOW, MotionErrors, Stratum,
-    TEMPORAL_NEIGHBOURS,
-};
+pub use error_model::{ErrorModel, ErrorStatistics, ErrorTable, Stratum, TEMPORAL_NEIGHBOURS};
 pub use inverse::{Inverse, Reading};
 pub use loss::Loss;
 pub use mixture::{Mixing, Mixture, ROUTE_DIM};

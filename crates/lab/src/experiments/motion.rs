@@ -27,7 +27,7 @@ pub struct MotionEvaluation {
     /// The adapter's estimate with the mean training motion μ, as `EstimateMotion` returns it.
     /// This and the next two are `None` without an adapter.
     pub ours: Option<LocalizationErrors>,
-    /// The adapter's estimate without μ, as trackers use it.
+    /// The adapter's estimate without μ, as retrieval uses it.
     pub without_mean: Option<LocalizationErrors>,
     /// The constant baseline, which always predicts μ.
     pub constant: Option<LocalizationErrors>,

@@ -1,62 +1,29 @@
 //! Evaluates a tracker on held-out frames: path errors, covariances, and detection of being lost.
 //!
 //! Start reading at [`evaluate`]. Every room is mapped and tracked under one hold-out. Frames of
-//! the other rooms are then replayed through its tracker, which should report LOST.
+//! the other rooms are then replayed in it, which should be reported LOST.
 
 use std::sync::Arc;
 
-use ndarray::{ArrayView1, ArrayView2};
 use rayon::prelude::*;
 use serde::{Serialize, Serializer};
 
-use seese3_core::adapter::Adapter;
 use seese3_core::cancel::Cancellation;
-use seese3_core::geometry::{Pose, PoseError};
-use seese3_core::navigation::{IndexKind, Navigator};
-use seese3_core::room::{FrameId, Room};
-use seese3_core::splits::HoldOut;
+use seese3_core::geometry::PoseError;
+use seese3_core::room::FrameId;
 use seese3_core::statistics::root_mean_square;
-use seese3_core::training::RoomData;
 use seese3_core::trajectory::{Relation, RpePairs, Statistics, Trajectory, ape, rpe};
-use seese3_robot::fitting::{RoomReader, fit};
-use seese3_robot::tracking::{
-    InitialPose, Map, MapMatch, MapQuery, MotionSurprise, Replay, Segment, Status, Tracker,
-    TrackerSettings, relocalize, replay, replay_streams,
-};
+use seese3_robot::tracking::{Map, MapMatch, MapQuery, Status, relocalize};
 
 use super::odometry_scenarios::Scenarios;
-use super::tracking_scores::TrackingScores;
-use super::{Error, Within, check_hold_out};
+use super::replay::{InitialPose, MotionSurprise, Replay};
+use super::tracked_room::TrackedRoom;
+use super::tracking_scores::{LostFrames, StatusShares, TrackingScores};
+use super::{Error, Within};
 use crate::json;
 
-/// Frame period of replays that contain frames of another room, nanoseconds: 30 Hz.
-pub(super) const PERIOD_NS: i64 = 33_333_333;
-/// Maximum number of frames of each other room replayed through a room's tracker.
-pub(super) const OTHER_ROOM_FRAMES: usize = 60;
 /// Stride of the tracked frames that are relocalized in all rooms.
 const RELOCALISED_STEP: usize = 5;
-
-/// Settings of an evaluation, besides the rooms and the adapter.
-#[derive(Debug, Clone, Copy)]
-pub struct OdometryProtocol {
-    /// Which frames are mapped and which are tracked.
-    pub hold_out: HoldOut,
-    /// Settings of the trackers.
-    pub settings: TrackerSettings,
-    /// Whether an adapter is fitted to each room's mapped frames, starting from the given
-    /// adapter's weights. The fitted adapter then provides the anchors.
-    pub is_fitted: bool,
-}
-
-/// A tracker over one room.
-pub struct TrackedRoom<'a> {
-    room: Arc<Room>,
-    /// Raw features, row by frame, shape (n, d).
-    features: ArrayView2<'a, f32>,
-    mapped: Vec<FrameId>,
-    map: Arc<Map>,
-    tracker: Tracker,
-}
 
 /// Tracking results of one room.
 #[derive(Debug, Clone, Serialize)]
@@ -93,9 +60,9 @@ pub struct RoomOdometry {
     /// room's own frames.
     #[serde(rename = "foreign")]
     pub other_rooms: [LostFrames; 2],
-    /// Parts without a map, kidnaps and wheels; absent for streams of an adapter.
+    /// Parts without a map, kidnaps and wheels.
     #[serde(flatten)]
-    pub scenarios: Option<Scenarios>,
+    pub scenarios: Scenarios,
 }
 
 /// Squared Mahalanobis lengths of map pose errors; in JSON, their coverage.
@@ -154,31 +121,6 @@ pub struct BothPaths {
     pub fused: f64,
 }
 
-/// Fractions of frames by reported status.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct StatusShares {
-    /// TRACKING.
-    pub tracking: f64,
-    /// DEGRADED.
-    pub degraded: f64,
-    /// LOST.
-    pub lost: f64,
-    /// RELOCALIZING.
-    pub relocalizing: f64,
-}
-
-impl StatusShares {
-    /// The shares by a function of the status.
-    pub fn of(share: impl Fn(Status) -> f64) -> Self {
-        Self {
-            tracking: share(Status::Tracking),
-            degraded: share(Status::Degraded),
-            lost: share(Status::Lost),
-            relocalizing: share(Status::Relocalizing),
-        }
-    }
-}
-
 /// Results of a stream without an initial pose.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct UnknownStart {
@@ -187,15 +129,6 @@ pub struct UnknownStart {
     pub lost: f64,
     /// Number of frames until the tracker was TRACKING near the true pose; `None` if it never was.
     pub frames_to_relocalise: Option<usize>,
-}
-
-/// Number of frames of other rooms, and of those reported LOST.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
-pub struct LostFrames {
-    /// Number of replayed frames.
-    pub frames: usize,
-    /// Number of frames reported LOST.
-    pub lost: usize,
 }
 
 /// Results of relocalizing single views among several rooms.
@@ -226,109 +159,21 @@ fn rms<S: Serializer>(errors: &[f64], to: S) -> Result<S::Ok, S::Error> {
     root_mean_square(errors).serialize(to)
 }
 
-impl TrackedRoom<'_> {
-    /// The room, with all its frames.
-    pub fn room(&self) -> &Room {
-        &self.room
-    }
-
-    /// A tracker over its mapped frames.
-    pub fn tracker(&self) -> &Tracker {
-        &self.tracker
-    }
-
-    /// The pose of the mapped frame most similar to a raw feature of shape (d,), by the cosine:
-    /// the retrieval baseline.
-    pub fn most_alike(&self, feature: ArrayView1<'_, f32>) -> &Pose {
-        let cosine = |frame: &&FrameId| {
-            let row = self.features.row(frame.row());
-            row.dot(&feature) / row.dot(&row).sqrt()
-        };
-        let best = self
-            .mapped
-            .iter()
-            .max_by(|a, b| cosine(a).total_cmp(&cosine(b)));
-
-        // A map has at least one frame.
-        let row = best.map_or(0, |frame| frame.row());
-        &self.room.poses()[row]
-    }
-
-    /// Raw features, row by frame, shape (n, d).
-    pub fn features(&self) -> ArrayView2<'_, f32> {
-        self.features
-    }
-}
-
-/// Builds one tracker per room, with the frames mapped under the protocol's hold-out.
-///
-/// # Errors
-/// [`Error`] when a room is too small or the adapter has no error model.
-pub fn trackers<'a>(
-    rooms: &[RoomData<'a>],
-    adapter: &Arc<Adapter>,
-    protocol: &OdometryProtocol,
-) -> Result<Vec<TrackedRoom<'a>>, Error> {
-    let tracker = |data: &RoomData<'a>| {
-        check_hold_out(data.room, protocol.hold_out)?;
-        let room = Arc::new(data.room.clone());
-        let mapped = protocol.hold_out.mapped(room.timeline());
-        let navigator = Navigator::new(
-            room.clone(),
-            data.features,
-            adapter.clone(),
-            IndexKind::Exact,
-        )?;
-
-        let what = || format!("room '{}'", room.id());
-        let map = Map::new(Arc::new(navigator), &mapped).within(what)?;
-        let mut map = map.with_features(data.features.rows(), &mapped);
-        if protocol.is_fitted {
-            let fitted = fit(data, &mapped, Some(adapter), 0, &|_| ()).within(what)?;
-            let reader = RoomReader::new(data, &mapped, Some(adapter.clone()), &fitted);
-            map = map.with_pose_reader(Arc::new(reader.within(what)?));
-        }
-
-        let map = Arc::new(map);
-        let tracker = Tracker::new(vec![map.clone()], protocol.settings).within(what)?;
-        Ok(TrackedRoom {
-            room,
-            features: data.features.rows(),
-            mapped,
-            map,
-            tracker,
-        })
-    };
-
-    rooms.iter().map(tracker).collect()
-}
-
 /// Tracks the held-out frames of every room. `done` is called with the result and the replay of
 /// each room.
 ///
 /// # Errors
 /// [`Error`] when a room's path cannot be compared with the true path.
-pub fn evaluate(
-    rooms: &[TrackedRoom<'_>],
-    hold_out: HoldOut,
+pub fn evaluate<'a>(
+    rooms: &[TrackedRoom<'a>],
     done: &(dyn Fn(&RoomOdometry, &Replay) + Sync),
 ) -> Result<Vec<RoomOdometry>, Error> {
-    let one = |room: &TrackedRoom<'_>| {
-        let given = own_replay(room, hold_out, InitialPose::Given);
-        let replays = RoomReplays {
-            room: &room.room,
-            hold_out,
-            given: &given,
-            unknown: &own_replay(room, hold_out, InitialPose::Unknown),
-            other_rooms: [None, Some(hold_out)].map(|own| lost_frames(room, rooms, own)),
-            nearest: &|frame| *room.most_alike(room.features.row(frame.row())),
-        };
-
-        let found = room_odometry(&replays)?;
+    let one = |room: &TrackedRoom<'a>| {
+        let given = room.own_replay(InitialPose::Given);
+        let found = room_odometry(room, rooms, &given)?;
         done(&found, &given);
         Ok(found)
     };
-
     rooms.par_iter().map(one).collect()
 }
 
@@ -336,21 +181,20 @@ pub fn evaluate(
 ///
 /// # Errors
 /// [`Error`] when a view cannot be matched.
-pub fn relocalisation(
-    rooms: &[TrackedRoom<'_>],
-    hold_out: HoldOut,
-) -> Result<Relocalisation, Error> {
-    let maps: Vec<Arc<Map>> = rooms.iter().map(|room| room.map.clone()).collect();
+pub fn relocalisation(rooms: &[TrackedRoom<'_>]) -> Result<Relocalisation, Error> {
+    let maps: Vec<Arc<Map>> = rooms
+        .iter()
+        .filter_map(|room| room.map().cloned())
+        .collect();
 
     let of_room = |(place, room): (usize, &TrackedRoom<'_>)| {
         let mut others = maps.clone();
-        others.remove(place);
+        let own = others.remove(place);
+        let latents = own.navigator().latents();
         let mut found = Relocalisation::default();
-        let tracked = hold_out.tracked(room.room.timeline());
 
-        for frame in tracked.into_iter().step_by(RELOCALISED_STEP) {
-            let feature = room.features.row(frame.row()).to_vec();
-            let latents = room.map.navigator().latents();
+        for frame in room.tracked().iter().step_by(RELOCALISED_STEP) {
+            let feature = room.features().row(frame.row()).to_vec();
             let view = MapQuery {
                 latent: latents.row(frame.row()),
                 feature: Some(&feature),
@@ -366,7 +210,7 @@ pub fn relocalisation(
                 found.ambiguous += 1;
             } else if answer.rooms[0].map == place {
                 found.right += 1;
-                found.add_pose(&answer.rooms[0].last, room, frame);
+                found.add_pose(&answer.rooms[0].last, room, *frame);
             } else {
                 found.wrong += 1;
             }
@@ -398,9 +242,9 @@ pub fn relocalisation(
 impl Relocalisation {
     /// Adds the pose errors of a view that was located in the right room.
     fn add_pose(&mut self, matched: &MapMatch, room: &TrackedRoom<'_>, frame: FrameId) {
-        let poses = room.room.poses();
+        let poses = room.room().poses();
         let truth = &poses[frame.row()];
-        let found = &matched.anchor.belief;
+        let found = &matched.pose;
         let nearest = &poses[matched.nearest[0].frame.row()];
 
         self.pose_surprises.extend(found.squared_error(truth));
@@ -410,29 +254,14 @@ impl Relocalisation {
     }
 }
 
-/// The replays of a room's tracked frames.
-pub(super) struct RoomReplays<'a> {
-    pub room: &'a Room,
-    pub hold_out: HoldOut,
-    /// With the true initial pose.
-    pub given: &'a Replay,
-    /// Without an initial pose.
-    pub unknown: &'a Replay,
-    /// LOST counts for frames of other rooms, see [`RoomOdometry::other_rooms`].
-    pub other_rooms: [LostFrames; 2],
-    /// The pose of the mapped frame most similar to a frame.
-    pub nearest: &'a dyn Fn(FrameId) -> Pose,
-}
-
-pub(super) fn room_odometry(replays: &RoomReplays<'_>) -> Result<RoomOdometry, Error> {
-    let RoomReplays {
-        room,
-        hold_out,
-        given: own,
-        unknown,
-        other_rooms,
-        nearest,
-    } = *replays;
+fn room_odometry<'a>(
+    tracked_room: &TrackedRoom<'a>,
+    all: &[TrackedRoom<'a>],
+    own: &Replay,
+) -> Result<RoomOdometry, Error> {
+    let (room, hold_out) = (tracked_room.room(), tracked_room.hold_out());
+    let unknown = tracked_room.own_replay(InitialPose::Unknown);
+    let baselines = tracked_room.baselines();
     let frame_count = room.frame_count();
     let what = || format!("room '{}'", room.id());
 
@@ -448,13 +277,18 @@ pub(super) fn room_odometry(replays: &RoomReplays<'_>) -> Result<RoomOdometry, E
         fused: fused[place],
     };
 
-    let tracked = hold_out.tracked(room.timeline());
+    let tracked = tracked_room.tracked();
     let has_mapped_neighbours =
         |row: usize| hold_out.has_mapped_neighbours(tracked[row], frame_count);
 
+    let streams = tracked_room.streams();
+    let example = streams.first().and_then(|stream| stream.views.first());
+    let views: Vec<_> = streams.iter().map(|stream| &stream.views[..]).collect();
+    let scenarios = Scenarios::of(&views, &|first| tracked_room.player(first, example));
+
     Ok(RoomOdometry {
         room: room.id().to_string(),
-        scores: TrackingScores::of(own, |row| nearest(tracked[row])),
+        scores: TrackingScores::of(own, |row| baselines.poses_of(tracked[row].row()).0),
         format: room.provenance().format.clone(),
         mapped_frames: hold_out.mapped(room.timeline()).len(),
         tracked_frames: own.updates.len(),
@@ -473,8 +307,8 @@ pub(super) fn room_odometry(replays: &RoomReplays<'_>) -> Result<RoomOdometry, E
             lost: unknown.share(Status::Lost),
             frames_to_relocalise: unknown.frames_to_relocalise(),
         },
-        other_rooms,
-        scenarios: None,
+        other_rooms: [false, true].map(|is_after_own| tracked_room.lost_frames(all, is_after_own)),
+        scenarios,
     })
 }
 
@@ -496,68 +330,4 @@ fn path_errors(estimate: &Trajectory, reference: &Trajectory) -> Result<[f64; 3]
         absolute(Relation::Rotation)?,
         Statistics::of(&relative).rmse,
     ])
-}
-
-/// Replays the tracked frames of a room through its own tracker.
-fn own_replay(room: &TrackedRoom<'_>, hold_out: HoldOut, initial_pose: InitialPose) -> Replay {
-    let segment = Segment {
-        latents: room.map.navigator().latents(),
-        features: Some(room.features),
-        poses: room.room.poses(),
-        frames: &hold_out.tracked(room.room.timeline()),
-    };
-
-    replay_streams(&room.tracker, segment, &room.room, initial_pose)
-}
-
-/// Replays frames of every other room through a room's tracker, and counts the LOST answers. With
-/// `own`, the last tracked frames of the room itself come first in the stream. A perfect tracker
-/// reports LOST for all frames of other rooms.
-fn lost_frames(
-    room: &TrackedRoom<'_>,
-    all: &[TrackedRoom<'_>],
-    own: Option<HoldOut>,
-) -> LostFrames {
-    let own_frames = own.map(|hold_out| {
-        let mut frames = hold_out.tracked(room.room.timeline());
-        frames.split_off(frames.len().saturating_sub(OTHER_ROOM_FRAMES))
-    });
-
-    let mut found = LostFrames::default();
-    for other in all.iter().filter(|other| other.room.id() != room.room.id()) {
-        let mut frames = HoldOut::Interleaved.tracked(other.room.timeline());
-        frames.truncate(OTHER_ROOM_FRAMES);
-        let theirs = Segment {
-            latents: other.map.navigator().latents(),
-            features: Some(other.features),
-            poses: other.room.poses(),
-            frames: &frames,
-        };
-
-        let replayed = match &own_frames {
-            None => replay(&room.tracker, &[theirs], PERIOD_NS, InitialPose::Unknown),
-            Some(own_frames) => {
-                let ours = Segment {
-                    latents: room.map.navigator().latents(),
-                    features: Some(room.features),
-                    poses: room.room.poses(),
-                    frames: own_frames,
-                };
-                replay(
-                    &room.tracker,
-                    &[ours, theirs],
-                    PERIOD_NS,
-                    InitialPose::Given,
-                )
-            }
-        };
-
-        // The other room's frames are the last ones of the replay.
-        let updates = &replayed.updates[replayed.updates.len() - frames.len()..];
-        let is_lost = |update: &&seese3_robot::tracking::Update| update.status == Status::Lost;
-        found.frames += updates.len();
-        found.lost += updates.iter().filter(is_lost).count();
-    }
-
-    found
 }

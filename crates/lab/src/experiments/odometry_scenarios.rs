@@ -6,7 +6,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 
-use super::keypoint_player::{PlayedView, Player, Sight};
+use super::player::{PlayedView, Player, Sight};
 use super::tracking_scores::is_wrong;
 use crate::json;
 use seese3_core::geometry::{Pose, PoseError, Twist, body_twist, exp};
@@ -102,7 +102,7 @@ fn as_median<S: serde::Serializer>(values: &[f64], to: S) -> Result<S::Ok, S::Er
 impl Scenarios {
     /// Runs all scenarios on the streams of a room. `player` starts a stream with this pose.
     pub(super) fn of<'a>(
-        streams: &[Vec<PlayedView<'a>>],
+        streams: &[&[PlayedView<'a>]],
         player: &dyn Fn(Option<Pose>) -> Player<'a>,
     ) -> Self {
         let mut gaps = GAPS_S.map(|seconds| GapErrors {
@@ -263,7 +263,7 @@ impl Kidnaps {
 
 /// Streams with simulated wheels.
 fn with_wheels<'a>(
-    streams: &[Vec<PlayedView<'a>>],
+    streams: &[&[PlayedView<'a>]],
     player: &dyn Fn(Option<Pose>) -> Player<'a>,
 ) -> WheelErrors {
     let (mut fused, mut alone) = (Vec::new(), Vec::new());

@@ -5,7 +5,9 @@ use serde::Serialize;
 
 use seese3_core::geometry::{Pose, PoseError, body_twist};
 use seese3_core::statistics::{mean, root_mean_square};
-use seese3_robot::tracking::{PoseWithCovariance, Replay, Status};
+use seese3_robot::tracking::{PoseWithCovariance, Status};
+
+use super::replay::Replay;
 
 use crate::json;
 
@@ -138,6 +140,40 @@ pub struct VelocityErrors {
     pub error_m_s: f64,
     /// Error of the zero-velocity baseline, which is the true speed.
     pub zero_m_s: f64,
+}
+
+/// Fractions of frames by reported status.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct StatusShares {
+    /// TRACKING.
+    pub tracking: f64,
+    /// DEGRADED.
+    pub degraded: f64,
+    /// LOST.
+    pub lost: f64,
+    /// RELOCALIZING.
+    pub relocalizing: f64,
+}
+
+impl StatusShares {
+    /// The shares by a function of the status.
+    pub fn of(share: impl Fn(Status) -> f64) -> Self {
+        Self {
+            tracking: share(Status::Tracking),
+            degraded: share(Status::Degraded),
+            lost: share(Status::Lost),
+            relocalizing: share(Status::Relocalizing),
+        }
+    }
+}
+
+/// Number of frames of other rooms, and of those reported LOST.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct LostFrames {
+    /// Number of replayed frames.
+    pub frames: usize,
+    /// Number of frames reported LOST.
+    pub lost: usize,
 }
 
 impl TrackingScores {

@@ -4,14 +4,12 @@ use serde::Serialize;
 
 use super::table::Column::{self, Number, Text};
 use super::table::{Table, fixed};
-use crate::experiments::odometry::{
-    MapPoseErrors, Relocalisation, RoomOdometry, StatusShares, squared_errors,
-};
+use crate::experiments::odometry::{MapPoseErrors, Relocalisation, RoomOdometry, squared_errors};
 use crate::experiments::odometry_scenarios::Scenarios;
-use crate::experiments::tracking_scores::TrackingScores;
+use crate::experiments::replay::MotionSurprise;
+use crate::experiments::tracking_scores::{StatusShares, TrackingScores};
 use crate::json;
 use seese3_core::statistics::{Rate, coverage, mean, median, root_mean_square};
-use seese3_robot::tracking::MotionSurprise;
 
 /// Number of groups of about equal size by which the coverage table splits motions by length.
 const STRATA: usize = 4;
@@ -161,7 +159,7 @@ fn motions(rooms: &[RoomOdometry]) -> Vec<MotionSurprise> {
 }
 
 fn scenarios(rooms: &[RoomOdometry]) -> Option<Scenarios> {
-    Scenarios::together(rooms.iter().filter_map(|room| room.scenarios.as_ref()))
+    Scenarios::together(rooms.iter().map(|room| &room.scenarios))
 }
 
 /// Position errors of parts without a map, kidnaps and wheels, over all rooms; `None` for streams of

@@ -8,8 +8,6 @@ use seese3_core::geometry::Pose;
 pub struct EmbeddedRoom<'a> {
     /// `world_from_camera`, one per frame.
     pub poses: &'a [Pose],
-    /// Latents, one row per frame, shape (n, k).
-    pub latents: Array2<f64>,
-    /// Columns of the latents that distances use, shape (n, c).
+    /// Columns of the latents that distances use, one row per frame, shape (n, c).
     pub coordinates: Array2<f64>,
 }

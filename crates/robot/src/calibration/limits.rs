@@ -3,7 +3,7 @@
 use ndarray::{Array2, ArrayView1};
 
 use super::Error;
-use seese3_core::adapter::{self, JUMP_WINDOW, TEMPORAL_NEIGHBOURS};
+use seese3_core::adapter::{self, TEMPORAL_NEIGHBOURS};
 use seese3_core::index::{ExactIndex, Exclusion, Index};
 use seese3_core::room::FrameId;
 use seese3_core::splits::is_in_left_out_block;
@@ -17,10 +17,6 @@ const OWN_SHARE: f64 = 0.97;
 const OTHERS_SHARE: f64 = 0.02;
 /// Quantile of other-room distances that is the limit of certain matches.
 const OTHERS_SHARE_CERTAIN: f64 = 0.0003;
-/// Quantile of own-room distances between successive views for the jump limit.
-const OWN_JUMP_SHARE: f64 = 0.999;
-/// Quantile of distances across a cut between rooms for the jump limit.
-const OTHERS_JUMP_SHARE: f64 = 0.01;
 
 /// Limits of match distances, in units of the room's typical distance.
 pub struct MatchLimits {
@@ -68,31 +64,6 @@ pub fn match_limits(rooms: &[Array2<f64>]) -> Result<MatchLimits, Error> {
     })
 }
 
-/// Jump limit, in standard deviations of frame noise: a view farther than this from each of the
-/// last [`JUMP_WINDOW`] frames has jumped. It is the geometric mean of a high quantile of distances
-/// within a room and a low quantile of distances across a cut to another room.
-pub fn jump_distance(rooms: &[Array2<f64>]) -> Result<f64, Error> {
-    let mut own = Vec::new();
-    let mut others = Vec::new();
-
-    for (place, room) in rooms.iter().enumerate() {
-        let successive = JUMP_WINDOW..room.nrows();
-        own.extend(successive.map(|row| nearest_before(room.row(row), room, row)));
-
-        // Cuts from the middle and the end of this room to the beginning and the middle of others.
-        for other in other_rooms(rooms, place) {
-            for before in [room.nrows() / 2, room.nrows()] {
-                let cuts = [0, other.nrows() / 2];
-                others.extend(cuts.map(|row| nearest_before(other.row(row), room, before)));
-            }
-        }
-    }
-
-    let longest_own = known(quantile(&own, OWN_JUMP_SHARE))?;
-    let shortest_cut = known(quantile(&others, OTHERS_JUMP_SHARE))?;
-    Ok((longest_own * shortest_cut).sqrt())
-}
-
 /// Median distance from a mapped frame to its nearest mapped frame more than
 /// [`TEMPORAL_NEIGHBOURS`] rows away.
 fn typical_distance(index: &ExactIndex, room: &Array2<f64>, mapped: &[FrameId]) -> f64 {
@@ -109,14 +80,6 @@ fn typical_distance(index: &ExactIndex, room: &Array2<f64>, mapped: &[FrameId]) 
         .collect();
 
     median(&distances)
-}
-
-/// Distance from a view to the nearest of the [`JUMP_WINDOW`] frames before row `before`.
-fn nearest_before(view: ArrayView1<'_, f64>, room: &Array2<f64>, before: usize) -> f64 {
-    let distance = |row: usize| (&view - &room.row(row)).mapv(|x| x * x).sum().sqrt();
-    (before.saturating_sub(JUMP_WINDOW)..before)
-        .map(distance)
-        .fold(f64::INFINITY, f64::min)
 }
 
 fn other_rooms(rooms: &[Array2<f64>], place: usize) -> impl Iterator<Item = &Array2<f64>> {

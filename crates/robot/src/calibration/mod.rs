@@ -1,39 +1,31 @@
 //! Calibration: measures an adapter's errors in rooms that it was not trained on.
 //!
-//! [`calibrate`] runs three steps in this order; step 3 needs the result of step 2:
+//! [`calibrate`] runs two steps:
 //!
 //! 1. `error_covariance`: the second moment of motion errors, used by calibrated retrieval.
-//! 2. `model`: the error model of a tracker: frame-to-frame noise of latents; errors of motions;
-//!    errors of poses estimated from the most similar map frames; and how far frames of one room are
-//!    from the map of another.
-//! 3. `map_pose_factor`: one factor for the covariances of the poses that a tracker reports on a
-//!    map, chosen by replaying the rooms through a tracker with the error model of step 2.
+//! 2. `model`: the error model of a map: frame-to-frame noise of latents; errors of poses estimated
+//!    from the most similar map frames; and how far frames of one room are from the map of another.
 //!
-//! Errors are heavy-tailed and differ between rooms. The covariances of motion and pose errors in
-//! the error model are therefore Student's t fits. Each is then scaled so that its 68 % and 95 %
+//! Errors are heavy-tailed and differ between rooms. The covariances of pose errors in the error
+//! model are therefore Student's t fits. Each is then scaled so that its 68 % and 95 %
 //! ellipsoids contain nearly 68 % and 95 % of the errors. The covariances of step 1 and of latents
 //! are plain second moments.
 
-mod anchors;
 mod embedded_room;
 mod error_covariance;
+mod frame_noise;
 mod limits;
-mod map_pose_factor;
+mod match_errors;
 mod model;
-mod motions;
-
-use std::sync::Arc;
 
 use nalgebra::{Matrix6, Vector6};
 
 use error_covariance::error_covariance;
-use map_pose_factor::map_pose_factor;
 
-use crate::tracking;
-use seese3_core::adapter::{self, Adapter, ErrorModel, ErrorStatistics, TrainingRecord};
+use seese3_core::adapter::{self, Adapter, ErrorModel, TrainingRecord};
 use seese3_core::room::RoomId;
+use seese3_core::statistics;
 use seese3_core::training::{self, RoomData, check_rooms};
-use seese3_core::{navigation, statistics};
 
 /// Minimum number of rooms for a tracker's error model: it compares frames of different rooms.
 pub const FEWEST_ROOMS_TO_TRACK: usize = 2;
@@ -48,12 +40,6 @@ pub enum Error {
     /// The adapter rejected the features, or the errors give no valid error model.
     #[error(transparent)]
     Adapter(#[from] adapter::Error),
-    /// A navigator could not be built for a room.
-    #[error(transparent)]
-    Navigation(#[from] navigation::Error),
-    /// A map or a tracker could not be built for a room.
-    #[error(transparent)]
-    Tracking(#[from] tracking::Error),
     /// The adapter was trained on one of the rooms.
     #[error(
         "the adapter was trained on room '{room}': its errors there are too small; name other rooms"
@@ -70,9 +56,6 @@ pub enum Error {
         /// Number of given rooms.
         given: usize,
     },
-    /// The tracker was never localized in any replay.
-    #[error("the tracker was never localized in the calibration rooms")]
-    NoPlaceFound,
 }
 
 /// A calibrated adapter with its finished record.
@@ -102,17 +85,9 @@ pub fn calibrate(
         return Ok(calibrated);
     }
 
-    let statistics = model::measure(&calibrated.adapter, &calibrated.record, rooms)?;
-    let preliminary = ErrorModel::new(statistics.clone())?;
-    let adapter = Arc::new(calibrated.adapter.with_error_model(preliminary)?);
-
-    // The map-pose factor is measured with a tracker that uses the preliminary error model.
-    let statistics = ErrorStatistics {
-        map_pose_factor: map_pose_factor(&adapter, rooms)?.ok_or(Error::NoPlaceFound)?,
-        ..statistics
-    };
+    let statistics = model::measure(&calibrated.adapter, rooms)?;
     let model = ErrorModel::new(statistics)?;
-    calibrated.adapter = Arc::unwrap_or_clone(adapter).with_error_model(model)?;
+    calibrated.adapter = calibrated.adapter.with_error_model(model)?;
     calibrated.can_track = true;
     Ok(calibrated)
 }

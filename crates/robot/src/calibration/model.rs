@@ -1,28 +1,24 @@
-//! The statistics of a tracker's error model, except the map-pose factor.
+//! The statistics of an error model.
 
 use ndarray::{Array2, s};
 
-use super::anchors::anchor_errors;
 use super::embedded_room::EmbeddedRoom;
-use super::limits::{jump_distance, match_limits};
-use super::motions::{RoomPair, fibonacci_strides, motion_errors, second_moment};
+use super::frame_noise::{RoomPair, second_moment};
+use super::limits::match_limits;
+use super::match_errors::match_errors;
 use super::{Error, FEWEST_ROOMS_TO_TRACK};
 use crate::tracking::frame_period_s;
-use seese3_core::adapter::{Adapter, ErrorStatistics, TrainingRecord, Whitener};
+use seese3_core::adapter::{Adapter, ErrorStatistics, Whitener};
 use seese3_core::splits::Split;
 use seese3_core::statistics::mean;
 use seese3_core::training::RoomData;
 
-/// Measures an adapter's errors in two or more rooms. The map-pose factor stays at 1.
+/// Measures an adapter's errors in two or more rooms.
 ///
 /// # Errors
 /// [`Error::FewRooms`], or [`Error::Adapter`] if the rooms are too short or their errors give no
 /// valid covariance.
-pub fn measure(
-    adapter: &Adapter,
-    record: &TrainingRecord,
-    rooms: &[RoomData<'_>],
-) -> Result<ErrorStatistics, Error> {
+pub fn measure(adapter: &Adapter, rooms: &[RoomData<'_>]) -> Result<ErrorStatistics, Error> {
     if rooms.len() < FEWEST_ROOMS_TO_TRACK {
         return Err(Error::FewRooms {
             least: FEWEST_ROOMS_TO_TRACK,
@@ -31,30 +27,16 @@ pub fn measure(
     }
 
     let embedded = embed(adapter, rooms)?;
-    let strides = fibonacci_strides(&record.pairs);
 
     // The difference of two successive latents has twice the noise of one latent.
     let frame_noise = second_moment(&embedded, &pairs_at(rooms, 1))? * 0.5;
-    let measured_pairs: Vec<RoomPair> = strides
-        .iter()
-        .flat_map(|&stride| pairs_at(rooms, stride))
-        .collect();
-    let motion_spread = second_moment(&embedded, &measured_pairs)?;
-
-    let spread_whitener = Whitener::new(motion_spread.view())?;
-    let pairs_by_stride: Vec<(u32, Vec<RoomPair>)> = strides
-        .iter()
-        .map(|&stride| (stride, pairs_at(rooms, stride)))
-        .collect();
-    let motion_errors = motion_errors(adapter, &embedded, &pairs_by_stride, &spread_whitener)?;
-
     // Match distances are in standard deviations of frame noise.
     let noise_whitener = Whitener::new(frame_noise.view())?;
     let whitened: Vec<Array2<f64>> = embedded
         .iter()
         .map(|room| noise_whitener.whitened(room.coordinates.view()))
         .collect();
-    let anchor_errors = anchor_errors(adapter, &embedded, &whitened)?;
+    let match_errors = match_errors(&embedded, &whitened)?;
     let limits = match_limits(&whitened)?;
 
     let periods: Vec<f64> = rooms.iter().map(|data| frame_period_s(data.room)).collect();
@@ -62,13 +44,9 @@ pub fn measure(
     Ok(ErrorStatistics {
         frame_period_s: mean(&periods),
         frame_noise,
-        motion_spread,
-        motion_errors,
-        anchor_errors,
+        match_errors,
         out_of_distribution_ratio: limits.out_of_distribution,
         certain_match_ratio: limits.certain,
-        jump_distance: jump_distance(&whitened)?,
-        map_pose_factor: 1.0,
     })
 }
 
@@ -81,7 +59,6 @@ fn embed<'a>(adapter: &Adapter, rooms: &'a [RoomData<'_>]) -> Result<Vec<Embedde
             .to_owned();
         embedded.push(EmbeddedRoom {
             poses: data.room.poses(),
-            latents,
             coordinates,
         });
     }

@@ -1,4 +1,7 @@
-//! The front end of a stream: what the keypoints of its images tell a [`crate::pose_filter`].
+//! The front end of a stream: what its views tell a [`crate::pose_filter`].
+//!
+//! A [`FrontEnd`] reads the keypoints of images; a [`RetrievalFrontEnd`] retrieves the most similar
+//! mapped frames of latents and features.
 //!
 //! 1. The camera is stated, that of the map, or estimated from the first views.
 //! 2. A view is located in the stream's room or, while that is unknown, in all rooms.
@@ -6,16 +9,19 @@
 //!    its keypoints.
 
 mod camera;
+mod retrieval;
 
 pub use camera::StreamCamera;
+pub use retrieval::{RetrievalFrontEnd, RetrievalReading, StreamView};
 
 use crate::localization::{KeypointRoom, LocatedView, NotLocated};
 use crate::matched_views::ViewKeypoints;
-use crate::pose_filter::ViewObservation;
-use crate::tracking::MatchedPose;
+use crate::pose_filter::{LocatedPose, Source, ViewObservation};
+use crate::tracking::{BestMatch, PoseWithCovariance};
 use crate::visual_odometry::{OdometryParameters, OdometryView, VisualMotion, VisualOdometry};
 use camera::CameraVotes;
 use seese3_core::geometry::{CameraIntrinsics, Pose};
+use seese3_core::index::Neighbour;
 use seese3_core::keypoints::Keypoints;
 use seese3_core::room::FrameId;
 
@@ -62,6 +68,44 @@ pub struct RoomCandidate<'a> {
     pub frames: Option<&'a [FrameId]>,
 }
 
+/// The pose of an image by its keypoints.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MatchedPose {
+    /// Index of the room in the filter.
+    pub room: usize,
+    /// `world_from_camera`.
+    pub pose: PoseWithCovariance,
+    /// How unlike the view is to the map, relative to the limit; at most 1.
+    pub novelty: f64,
+    /// The mapped frame with the most matched keypoints.
+    pub best_frame: FrameId,
+}
+
+impl MatchedPose {
+    /// The mapped frame with the most matched keypoints; the distance is `novelty`.
+    pub fn best_match(&self) -> BestMatch {
+        BestMatch {
+            room: self.room,
+            frame: Neighbour {
+                frame: self.best_frame,
+                distance: self.novelty,
+            },
+            camera: None,
+        }
+    }
+
+    /// The observation of a filter.
+    pub fn located(&self) -> LocatedPose {
+        LocatedPose {
+            room: self.room,
+            pose: self.pose,
+            source: Source::Matched,
+            is_of_room: true,
+            camera: None,
+        }
+    }
+}
+
 /// What an image tells.
 #[derive(Debug, Clone, Default)]
 pub struct ImageReading {
@@ -89,14 +133,13 @@ impl ImageReading {
         let why_not = self.why_not.filter(|_| self.matched.is_none());
         let unlocated = why_not.map_or_else(String::new, |why| why.to_string());
         ViewObservation {
-            time_ns,
-            sequence,
-            matched: self.matched,
+            located: self.matched.iter().map(MatchedPose::located).collect(),
+            best_match: self.matched.as_ref().map(MatchedPose::best_match),
             novelty,
             unlocated,
             fingerprint,
             visual: self.motion,
-            measured: None,
+            ..ViewObservation::empty(time_ns, sequence)
         }
     }
 }
@@ -139,18 +182,37 @@ impl FrontEnd {
         self.odometry.is_some()
     }
 
+    /// Notes a frame without an image, or with a blank one.
+    pub fn skip(&mut self, time_ns: i64) {
+        let seconds = self.seconds_to(time_ns);
+        if let Some(last) = &mut self.last {
+            last.time_ns = time_ns;
+        }
+        if let Some(odometry) = &mut self.odometry {
+            odometry.skip(seconds);
+        }
+    }
+
+    /// Seconds from the last frame to this one; 0 for the first.
+    fn seconds_to(&self, time_ns: i64) -> f64 {
+        self.last
+            .map_or(0.0, |last| time_ns.abs_diff(last.time_ns) as f64 * 1e-9)
+    }
+
     /// Reads an image. An image that is identical to the last one tells nothing new.
     pub fn read(&mut self, image: &StreamImage<'_>, rooms: &[RoomCandidate<'_>]) -> ImageReading {
-        let last = self.last.replace(LastImage {
-            time_ns: image.time_ns,
-            fingerprint: image.fingerprint,
-        });
-        let is_repeated = last.is_some_and(|last| {
+        let is_repeated = self.last.is_some_and(|last| {
             last.fingerprint.is_some() && last.fingerprint == image.fingerprint
         });
         if is_repeated {
+            self.skip(image.time_ns);
             return ImageReading::default();
         }
+        let seconds = self.seconds_to(image.time_ns);
+        self.last = Some(LastImage {
+            time_ns: image.time_ns,
+            fingerprint: image.fingerprint,
+        });
 
         let estimated = match &mut self.camera {
             StreamCamera::Stated(_) | StreamCamera::Mapping => None,
@@ -168,7 +230,7 @@ impl FrontEnd {
         }
 
         let found = self.located(image, rooms, estimated);
-        let motion = self.moved(image, rooms, &found, (estimated, last));
+        let motion = self.moved(image, rooms, &found, (estimated, seconds));
         let matched = found.located.map(|(place, located)| {
             let row = located.matched.best_frame();
             let candidate = &rooms[place];
@@ -250,7 +312,7 @@ impl FrontEnd {
         image: &StreamImage<'_>,
         rooms: &[RoomCandidate<'_>],
         found: &FoundView,
-        (estimated, last): (Option<CameraIntrinsics>, Option<LastImage>),
+        (estimated, seconds): (Option<CameraIntrinsics>, f64),
     ) -> Option<VisualMotion> {
         let located = found.located.as_ref();
         let candidate = rooms.get(located.map_or(0, |(place, _)| *place));
@@ -263,7 +325,6 @@ impl FrontEnd {
         let depths = located.map_or_else(Vec::new, |(place, view)| {
             rooms[*place].room.known_depths(view)
         });
-        let seconds = last.map_or(0.0, |last| (image.time_ns - last.time_ns) as f64 * 1e-9);
         self.odometry.as_mut()?.observe(&OdometryView {
             view: ViewKeypoints {
                 keypoints: image.keypoints,

@@ -50,7 +50,7 @@ impl AdapterLocalizer<'_> {
             None => reader.and_then(|(reader, feature)| reader.distance_over_range(feature)),
         };
 
-        let blended = matched.map(|found| found.anchor.belief);
+        let blended = matched.map(|found| found.pose);
         let (pose, method): (PoseWithCovariance, Method) = match (fitted, blended) {
             (Some(fitted), _) => (fitted, Method::FittedAdapter),
             (None, Some(blended)) => (blended, Method::SimilarFrames),

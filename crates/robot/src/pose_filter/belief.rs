@@ -19,7 +19,7 @@ const WHEEL_CURVE: usize = 2;
 const VISUAL_SCALE: usize = 5;
 type StateMatrix = SMatrix<f64, STATE, STATE>;
 type JointMatrix = SMatrix<f64, JOINT, JOINT>;
-type Observed = SMatrix<f64, 6, JOINT>;
+type Observed<const N: usize> = SMatrix<f64, N, JOINT>;
 
 /// Factor on the process noise of a prior that tells nothing.
 const UNINFORMATIVE: f64 = 1e4;
@@ -37,7 +37,7 @@ const END_VELOCITY: usize = 12;
 const END_CORRELATED: usize = 18;
 const END_MOTIONS: usize = 24;
 
-/// Pose, velocity, and the lasting errors of located poses and of measured motions, with the
+/// Pose, velocity, the correlated error of located poses, and the errors of measured motions, with the
 /// covariance of the errors of all four.
 ///
 /// The pose error δ is in the body frame, true = pose · exp(δ), ordered (v, ω), in meters and
@@ -48,7 +48,7 @@ pub struct Belief {
     pub pose: Pose,
     /// In the camera's body frame, meters and radians per second.
     pub velocity: Twist,
-    /// Lasting error of located poses, in standard deviations of each pose.
+    /// Correlated error of located poses, in standard deviations of each pose.
     pub correlated_error: Vector6<f64>,
     /// Errors of wheel odometry, in standard deviations of its drift: scale of the translations, scale
     /// of the rotations, and rotation about each axis per meter. Then the error of the scale of visual
@@ -80,11 +80,12 @@ pub struct Step {
 }
 
 /// A linear observation of the error state.
-pub struct Observation {
-    residual: Vector6<f64>,
+pub struct Observation<const N: usize> {
+    pub residual: SVector<f64, N>,
     /// Derivative of the residual with respect to the error state.
-    derivative: Observed,
-    noise: Matrix6<f64>,
+    pub derivative: Observed<N>,
+    /// Covariance of its independent noise.
+    pub noise: SMatrix<f64, N, N>,
 }
 
 impl Belief {
@@ -139,6 +140,31 @@ impl Belief {
         self.covariance
             .fixed_view_mut::<6, 6>(VELOCITY, VELOCITY)
             .copy_from(covariance);
+        self
+    }
+
+    /// The state with the errors of motion sensors of another one, independent of all other errors:
+    /// they belong to the sensors, not to the place.
+    #[must_use]
+    pub fn with_sensors_of(mut self, other: Option<&Self>) -> Self {
+        let Some(other) = other else {
+            return self;
+        };
+        self.motion_errors = other.motion_errors;
+        let of_other = other
+            .covariance
+            .fixed_view::<MOTION_ERRORS, MOTION_ERRORS>(MOTIONS, MOTIONS);
+        let mut covariance = self.covariance;
+        covariance
+            .fixed_rows_mut::<MOTION_ERRORS>(MOTIONS)
+            .fill(0.0);
+        covariance
+            .fixed_columns_mut::<MOTION_ERRORS>(MOTIONS)
+            .fill(0.0);
+        covariance
+            .fixed_view_mut::<MOTION_ERRORS, MOTION_ERRORS>(MOTIONS, MOTIONS)
+            .copy_from(&of_other);
+        self.covariance = covariance;
         self
     }
 
@@ -222,28 +248,20 @@ impl Belief {
 impl Step {
     /// The observation of a located pose.
     ///
-    /// Its error is L (√ρ · correlated error + √(1 − ρ) · noise) with L Lᵀ its covariance and the
-    /// correlated share ρ.
-    pub fn located(
-        &self,
-        located: &PoseWithCovariance,
-        parameters: &FilterParameters,
-    ) -> Observation {
-        let scale = correlated_scale(located, parameters.correlated_share);
-        let mut derivative = Observed::zeros();
-        let mut block = |column: usize, of: &Matrix6<f64>| {
-            derivative.fixed_view_mut::<6, 6>(0, column).copy_from(of);
-        };
-        block(START, &adjoint(&self.motion.inverse()));
-        block(MOTION, &Matrix6::identity());
-        block(END_CORRELATED, &-scale);
+    /// Its error is L (√ρ · correlated error + √(1 − ρ) · noise) with L Lᵀ its covariance and ρ the
+    /// `correlated_share`.
+    pub fn located(&self, located: &PoseWithCovariance, correlated_share: f64) -> Observation<6> {
+        let scale = correlated_scale(located, correlated_share);
+        let mut derivative = self.end_derivative();
+        derivative
+            .fixed_view_mut::<6, 6>(0, END_CORRELATED)
+            .copy_from(&-scale);
 
-        let expected = self.start * self.motion;
-        let difference = log(&expected.inv_mul(&located.pose)).to_vector();
+        let difference = log(&self.end_pose().inv_mul(&located.pose)).to_vector();
         Observation {
             residual: difference + scale * self.correlated_error,
             derivative,
-            noise: located.covariance * (1.0 - parameters.correlated_share),
+            noise: located.covariance * (1.0 - correlated_share),
         }
     }
 
@@ -252,7 +270,7 @@ impl Step {
     /// The drift is a scale error of translations, a scale error of rotations, and a rotation per meter
     /// forward, as those of a wrong wheel radius, a wrong track width and unequal wheels. The optical
     /// axis points forward.
-    pub fn by_wheels(&self, motion: &Pose, drift: &Drift, noise: &MotionNoise) -> Observation {
+    pub fn by_wheels(&self, motion: &Pose, drift: &Drift, noise: &MotionNoise) -> Observation<6> {
         let Twist { linear, angular } = log(motion);
         let mut errors = SMatrix::<f64, 6, MOTION_ERRORS>::zeros();
         errors
@@ -268,7 +286,11 @@ impl Step {
     }
 
     /// The observation of the motion by visual odometry.
-    pub fn by_images(&self, visual: &VisualMotion, parameters: &FilterParameters) -> Observation {
+    pub fn by_images(
+        &self,
+        visual: &VisualMotion,
+        parameters: &FilterParameters,
+    ) -> Observation<6> {
         let mut errors = SMatrix::<f64, 6, MOTION_ERRORS>::zeros();
         errors
             .fixed_view_mut::<3, 1>(0, VISUAL_SCALE)
@@ -287,7 +309,7 @@ impl Step {
         motion: &Pose,
         errors: &SMatrix<f64, 6, MOTION_ERRORS>,
         noise: &MotionNoise,
-    ) -> Observation {
+    ) -> Observation<6> {
         let mut derivative = Observed::zeros();
         derivative
             .fixed_view_mut::<6, 6>(0, MOTION)
@@ -321,20 +343,17 @@ impl Step {
 
     /// Squared Mahalanobis length of the innovation: χ² with six degrees of freedom if all
     /// covariances are correct. Infinite if the sum of the covariances is not positive definite.
-    pub fn squared_innovation(&self, observed: &Observation) -> f64 {
+    pub fn squared_innovation<const N: usize>(&self, observed: &Observation<N>) -> f64 {
         let innovation = observed.residual;
-        let sum = Cholesky::new(self.innovation_covariance(observed));
+        let sum = Cholesky::new(self.state_covariance(observed) + observed.noise);
         sum.map_or(f64::INFINITY, |sum| innovation.dot(&sum.solve(&innovation)))
     }
 
     /// Kalman update; `factor` is on the covariance of the observation's noise. The observation is one
     /// of the current state. Nothing changes if the sum of the covariances is not positive definite.
-    pub fn update(&mut self, observed: &Observation, factor: f64) {
-        let observed = Observation {
-            noise: observed.noise * factor,
-            ..*observed
-        };
-        let Some(sum) = Cholesky::new(self.innovation_covariance(&observed)) else {
+    pub fn update<const N: usize>(&mut self, observed: &Observation<N>, factor: f64) {
+        let noise = observed.noise * factor;
+        let Some(sum) = Cholesky::new(self.state_covariance(observed) + noise) else {
             return;
         };
         let gain = self.covariance * observed.derivative.transpose() * sum.inverse();
@@ -349,7 +368,7 @@ impl Step {
         // Joseph's form: (I − K H) P (I − K H)ᵀ + K R Kᵀ.
         let rest = JointMatrix::identity() - gain * observed.derivative;
         self.covariance =
-            rest * self.covariance * rest.transpose() + gain * observed.noise * gain.transpose();
+            rest * self.covariance * rest.transpose() + gain * noise * gain.transpose();
     }
 
     /// The motion of the step, `start_from_end`. Time-correlated errors of located poses cancel in it.
@@ -387,9 +406,26 @@ impl Step {
         }
     }
 
-    fn innovation_covariance(&self, observed: &Observation) -> Matrix6<f64> {
-        let of_state = observed.derivative * self.covariance * observed.derivative.transpose();
-        of_state + observed.noise
+    /// The final pose.
+    pub fn end_pose(&self) -> Pose {
+        self.start * self.motion
+    }
+
+    /// Derivative of the final pose error with respect to the error state.
+    pub fn end_derivative(&self) -> Observed<6> {
+        let mut derivative = Observed::zeros();
+        derivative
+            .fixed_view_mut::<6, 6>(0, START)
+            .copy_from(&adjoint(&self.motion.inverse()));
+        derivative
+            .fixed_view_mut::<6, 6>(0, MOTION)
+            .fill_with_identity();
+        derivative
+    }
+
+    /// Covariance of the residual without its noise.
+    fn state_covariance<const N: usize>(&self, observed: &Observation<N>) -> SMatrix<f64, N, N> {
+        observed.derivative * self.covariance * observed.derivative.transpose()
     }
 }
 

@@ -1,32 +1,38 @@
-//! A filter on a camera's pose in a map: located poses correct what the motion prior predicts.
+//! A filter on a camera's pose in a map: located poses correct what the motions predict.
 //!
-//! Start reading at [`PoseFilter::observe`]. It needs no adapter: a view's pose is located by its
-//! keypoints, see [`crate::matched_views`].
+//! Start reading at [`PoseFilter::observe`]. A [`crate::front_end`] makes its observations:
 //!
-//! - The filter is stateless: all data of a stream are in its [`FilterState`].
-//! - The error of a located pose is the sum of a correlated part and white noise; see [`Belief`].
-//!   The filter does not average the correlated part out.
-//! - A located pose that contradicts the belief is not used. Two in a row that agree replace it.
-//! - Measured motions (visual odometry, wheels) replace the motion prior, which smooths the velocity.
+//! | source | observation | error |
+//! | --- | --- | --- |
+//! | view matched by keypoints, or most similar mapped frames | pose in the room | covariance of the pose; a share of it is correlated over motion |
+//! | visual odometry, wheels | motion since the last frame | scale and drift are part of the state; the rest is independent |
+//! | gravity | tilt | correlated over time |
+//! | client | initial pose | as stated |
+//!
+//! - A filter holds no data of a stream; they are in its [`FilterState`].
+//! - A located pose or a tilt beyond its gate counts less. A located pose that contradicts the belief
+//!   is not used. Several in a row that agree replace it.
+//! - Measured motions replace the motion prior, which smooths the velocity.
 //! - `odom_from_camera` composes the motions without the located poses. It is continuous and drifts.
 
 mod belief;
+mod gravity;
 mod state;
 mod saved;
 mod status;
 
 pub use belief::Belief;
+pub use gravity::MeasuredGravity;
 pub use saved::SavedState;
 pub use state::{
-    Disagreement, FilterCandidate, FilterState, KeyframeMark, LastView, OdometryMark,
-    ViewObservation,
+    Disagreement, FilterCandidate, FilterState, KeyframeMark, LastView, LocatedPose, OdometryMark,
+    Source, ViewObservation,
 };
 
-use crate::tracking::{
-    Drift, MatchedPose, MotionPrior, PoseWithCovariance, Refusal, Status, Update, extent_m,
-};
+use crate::tracking::{Drift, MotionPrior, PoseWithCovariance, Refusal, Status, Update, extent_m};
 use crate::visual_odometry::VisualMotion;
-use belief::{Step, twist_covariance};
+use belief::{Observation, Step, twist_covariance};
+use gravity::Tilted;
 use nalgebra::{Matrix6, Vector6};
 use seese3_core::geometry::{Pose, Twist, log};
 use seese3_core::room::{FrameId, Room};
@@ -34,10 +40,13 @@ use seese3_core::room::{FrameId, Room};
 /// Parameters of a filter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FilterParameters {
-    /// Share of the variance of a located pose that is correlated from view to view, 0 to 1.
-    pub correlated_share: f64,
-    /// Distance, meters, and angle, radians, over which that part decays by a factor e. It is the
-    /// error of the map points in view: a camera at rest does not average it out.
+    /// Poses of views that are matched by keypoints.
+    pub matched: LocatedParameters,
+    /// Poses by the most similar mapped frames.
+    pub retrieved: LocatedParameters,
+    /// Distance, meters, and angle, radians, over which the correlated part of the errors of located
+    /// poses decays by a factor e. It is the error of the map in view: a camera at rest does not
+    /// average it out.
     pub correlation_range: [f64; 2],
     /// Factor on the process noise of the motion prior: a person turns and stops more abruptly than
     /// a Gaussian process.
@@ -47,15 +56,17 @@ pub struct FilterParameters {
     pub gate: f64,
     /// Squared Mahalanobis length of an innovation above which a located pose is not used.
     pub outlier_gate: f64,
-    /// Number of consecutive located poses that must agree to start the tracking, or to replace a
-    /// pose that they contradict.
-    pub views_to_agree: u32,
-    /// Maximum time between two such poses, seconds. After a longer gap, an uncertain belief needs
-    /// `views_to_agree` poses again.
+    /// Maximum time between two poses that agree, seconds. After a longer gap, an uncertain belief
+    /// needs `views_to_agree` poses again.
     pub max_candidate_s: f64,
     /// Time without a located view and without visual odometry after which a stream is DEGRADED,
     /// seconds.
     pub max_unlocated_s: f64,
+    /// Squared Mahalanobis length of a tilt above which gravity counts less.
+    pub gravity_gate: f64,
+    /// Correlation time of the direction of measured gravity, seconds. Its errors come mostly from
+    /// accelerations.
+    pub gravity_correlation_s: f64,
     /// Largest standard deviations of the position along any direction, meters, and of the rotation
     /// about any axis, radians, while TRACKING.
     pub max_deviation: [f64; 2],
@@ -77,22 +88,43 @@ pub struct FilterParameters {
     pub max_unchanged_frames: u32,
     /// Interval of keyframes, in frames; at least 1.
     pub keyframe_frames: u32,
+    /// Motion since the keyframe that triggers a new one, ‖(v, ω)‖, meters and radians mixed.
+    pub keyframe_displacement: f64,
     /// Whether located poses are used.
     pub fuse: bool,
+}
+
+/// Parameters of located poses from one kind of source.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LocatedParameters {
+    /// Share of the variance of a pose that is correlated from view to view, 0 to 1.
+    pub correlated_share: f64,
+    /// Number of consecutive poses that must agree to start the tracking, or to replace a pose that
+    /// they contradict.
+    pub views_to_agree: u32,
 }
 
 impl Default for FilterParameters {
     fn default() -> Self {
         Self {
-            correlated_share: 0.7,
+            matched: LocatedParameters {
+                correlated_share: 0.7,
+                views_to_agree: 2,
+            },
+            retrieved: LocatedParameters {
+                correlated_share: 0.7,
+                views_to_agree: 10,
+            },
             correlation_range: [0.15, 0.15],
-            process_noise_factor: 2.0,
+            process_noise_factor: 4.0,
             // The 99 % quantile of χ² with six degrees of freedom, and four times that.
             gate: 16.81,
             outlier_gate: 67.24,
-            views_to_agree: 2,
             max_candidate_s: 5.0,
             max_unlocated_s: 0.1,
+            // The 99 % quantile of χ² with two degrees of freedom.
+            gravity_gate: 9.21,
+            gravity_correlation_s: 2.0,
             // Errors of 0.2 m and 10° are 2.6 standard deviations: rarer than 1 in 100.
             max_deviation: [0.077, 0.067],
             wheel_noise: MotionNoise::WHEELS,
@@ -103,6 +135,7 @@ impl Default for FilterParameters {
             max_speed: [10.0, 15.0],
             max_unchanged_frames: 5,
             keyframe_frames: 30,
+            keyframe_displacement: f64::INFINITY,
             fuse: true,
         }
     }
@@ -184,9 +217,12 @@ struct Motions<'a> {
     since: Option<u64>,
 }
 
-/// A located pose, with its squared innovation if there is a belief in its room.
+/// A located pose that holds something new.
 struct Located<'a> {
-    matched: &'a MatchedPose,
+    located: &'a LocatedPose,
+    /// Number of such poses of the same frame, which together count as one.
+    count: f64,
+    /// Squared innovation, if there is a belief in its room.
     squared_innovation: Option<f64>,
 }
 
@@ -228,7 +264,8 @@ impl PoseFilter {
         let Some(room) = state.room else {
             return;
         };
-        state.belief = Some(Belief::at(pose, &self.rooms[room].motion_prior, 0.0));
+        let belief = Belief::at(pose, &self.rooms[room].motion_prior, 0.0);
+        state.belief = Some(belief.with_sensors_of(state.belief.as_ref()));
         state.is_placed = true;
         state.candidate = None;
         state.located_ns = state.last.map(|last| last.time_ns);
@@ -277,7 +314,9 @@ impl PoseFilter {
         // After a frame without a motion, the camera may be anywhere. The first image, or an identical
         // one, has no motion to measure.
         let has_no_motion = is_first || state.unchanged_frames > 0;
-        state.is_carried &= motions.visual.is_some() || has_no_motion;
+        // Wheels alone carry a pose that is not to be corrected.
+        let is_driven = motions.wheels.is_some() && !self.parameters.fuse;
+        state.is_carried &= motions.visual.is_some() || is_driven || has_no_motion;
         if state.is_carried {
             state.sight_ns = Some(frame.time_ns);
         }
@@ -286,31 +325,29 @@ impl PoseFilter {
         let motion = step.motion();
         state.odom = state.odom.composed(&motion);
 
-        // 2. Correct. An identical image holds nothing new.
-        let is_new = self.parameters.fuse && state.unchanged_frames == 0;
-        let matched = frame.matched.filter(|_| is_new);
-        let squared_innovation =
-            matched.and_then(|matched| self.squared_innovation(state, &step, &matched));
-        let correction = match &matched {
-            Some(matched) => {
-                let located = Located {
-                    matched,
-                    squared_innovation,
-                };
-                self.correct(state, &mut step, frame, &motions, &located)
-            }
-            None => Correction::Unused,
-        };
+        // 2. Correct by the located views.
+        let located = self.located(state, &step, frame);
+        let correction = self.correct_by_views(state, &mut step, frame, &motions, &located);
 
-        // 3. The belief after the step.
+        // 3. Correct the tilt, and make the belief after the step.
+        let tilted = match &frame.gravity {
+            Some(gravity)
+                if self.parameters.fuse
+                    && state.is_placed
+                    && correction != Correction::Replaced =>
+            {
+                self.level(state, &mut step, frame, gravity)
+            }
+            _ => None,
+        };
         state.mark_measured(frame);
-        let keyframe = state.keyframe_with(frame, &motion, self.parameters.keyframe_frames);
+        let keyframe = state.keyframe_with(frame, &motion, &self.parameters);
         let replaced = state.belief.filter(|_| correction == Correction::Replaced);
         let belief = replaced.unwrap_or_else(|| step.end());
         state.belief = Some(belief);
 
         // 4. Report.
-        let (status, reason) = self.status(state, frame);
+        let (status, reason) = self.status(state, frame, tilted);
         // A camera that is lost among several rooms has to be found again.
         let is_somewhere = status == Status::Lost && self.rooms.len() > 1;
         Ok(Update {
@@ -327,13 +364,105 @@ impl PoseFilter {
             reason,
             out_of_distribution: frame.novelty,
             room: state.room.filter(|_| !is_somewhere),
-            best_match: matched.map(|matched| (matched.room, matched.best_match())),
-            best_camera: None,
+            best_match: frame.best_match,
             match_used: correction != Correction::Unused,
-            surprise: squared_innovation,
+            surprise: located
+                .first()
+                .and_then(|leading| leading.squared_innovation),
             candidate: state.candidate.as_ref().map(FilterCandidate::reported),
-            anchors_needed: self.parameters.views_to_agree,
         })
+    }
+
+    /// The located poses of a frame that hold something new.
+    fn located<'a>(
+        &self,
+        state: &FilterState,
+        step: &Step,
+        frame: &'a ViewObservation,
+    ) -> Vec<Located<'a>> {
+        let is_new = |located: &&LocatedPose| {
+            self.parameters.fuse && (state.unchanged_frames == 0 || located.camera.is_some())
+        };
+        let new: Vec<&LocatedPose> = frame.located.iter().filter(is_new).collect();
+        let count = new.len() as f64;
+        let judged = |located: &'a LocatedPose| {
+            let is_here = state.is_placed && state.room == Some(located.room);
+            let squared_innovation =
+                is_here.then(|| step.squared_innovation(&self.observed(step, located, count)));
+            Located {
+                located,
+                count,
+                squared_innovation,
+            }
+        };
+        new.into_iter().map(judged).collect()
+    }
+
+    /// Corrects the step by the located poses of a frame. Only the first one may support a candidate.
+    fn correct_by_views(
+        &self,
+        state: &mut FilterState,
+        step: &mut Step,
+        frame: &ViewObservation,
+        motions: &Motions<'_>,
+        located: &[Located<'_>],
+    ) -> Correction {
+        let Some((leading, others)) = located.split_first() else {
+            return Correction::Unused;
+        };
+        let correction = self.correct(state, step, frame, motions, leading);
+        if correction == Correction::Applied {
+            for other in others {
+                self.apply(step, other);
+            }
+        }
+        correction
+    }
+
+    /// Corrects the tilt of a step; returns a contradiction.
+    fn level(
+        &self,
+        state: &mut FilterState,
+        step: &mut Step,
+        frame: &ViewObservation,
+        gravity: &MeasuredGravity,
+    ) -> Option<Tilted> {
+        let seconds = state.gravity_ns.map_or(f64::INFINITY, |earlier| {
+            frame.time_ns.abs_diff(earlier) as f64 * 1e-9
+        });
+        state.gravity_ns = Some(frame.time_ns);
+        gravity.correct(step, seconds, &self.parameters)
+    }
+
+    fn parameters_of(&self, source: Source) -> LocatedParameters {
+        match source {
+            Source::Matched => self.parameters.matched,
+            Source::Retrieved => self.parameters.retrieved,
+        }
+    }
+
+    /// Corrects the step by a pose that does not contradict it; returns whether it did.
+    fn apply(&self, step: &mut Step, found: &Located<'_>) -> bool {
+        let squared_innovation = found.squared_innovation.unwrap_or(f64::INFINITY);
+        let is_consistent = squared_innovation <= self.parameters.outlier_gate;
+        if is_consistent {
+            // Errors have heavier tails than a Gaussian.
+            let factor = (squared_innovation / self.parameters.gate).max(1.0).powi(2);
+            let observed = self.observed(step, found.located, found.count);
+            step.update(&observed, factor);
+        }
+        is_consistent
+    }
+
+    /// The observation of one of `count` poses that together count as one: they share the correlated
+    /// part of the error.
+    fn observed(&self, step: &Step, located: &LocatedPose, count: f64) -> Observation<6> {
+        let share = self.parameters_of(located.source).correlated_share;
+        let observed = step.located(&located.pose, share);
+        Observation {
+            noise: observed.noise * count,
+            ..observed
+        }
     }
 
     /// The motions, without both if wheel and visual odometry contradict each other: wheels slip, or
@@ -418,7 +547,7 @@ impl PoseFilter {
         }
     }
 
-    /// Corrects the step by a located pose.
+    /// Corrects the step by the leading located pose.
     ///
     /// Without a belief, or if the pose contradicts it, the pose supports a candidate. The same applies
     /// if no view was located recently and the belief is uncertain, because almost any pose passes the
@@ -429,55 +558,56 @@ impl PoseFilter {
         step: &mut Step,
         frame: &ViewObservation,
         motions: &Motions<'_>,
-        located: &Located<'_>,
+        leading: &Located<'_>,
     ) -> Correction {
         let parameters = &self.parameters;
-        let matched = located.matched;
-        let earlier = state.candidate.take();
+        let located = leading.located;
+        let earlier = if located.is_of_room {
+            state.candidate.take()
+        } else {
+            None
+        };
 
         let seconds = |since: i64| frame.time_ns.abs_diff(since) as f64 * 1e-9;
         let is_recent = state
             .located_ns
             .is_some_and(|located| seconds(located) <= parameters.max_candidate_s);
         let is_certain = is_recent || step.end().place().tells_a_place();
-        let squared_innovation = located
-            .squared_innovation
-            .filter(|_| is_certain)
-            .unwrap_or(f64::INFINITY);
-        if squared_innovation <= parameters.outlier_gate {
-            // Errors have heavier tails than a Gaussian.
-            let factor = (squared_innovation / parameters.gate).max(1.0).powi(2);
-            let observed = step.located(&matched.pose, parameters);
-            step.update(&observed, factor);
-            state.located_ns = Some(frame.time_ns);
-            state.sight_ns = Some(frame.time_ns);
-            state.is_carried = true;
+        if is_certain && self.apply(step, leading) {
+            if located.is_of_room {
+                state.mark_located(frame.time_ns);
+            }
             return Correction::Applied;
         }
+        if !located.is_of_room {
+            return Correction::Unused;
+        }
 
+        let LocatedParameters {
+            correlated_share,
+            views_to_agree: needed,
+        } = self.parameters_of(located.source);
         let (belief, agreeing) = earlier
-            .and_then(|candidate| self.supported(&candidate, frame, motions, matched))
+            .and_then(|candidate| self.supported(&candidate, frame, motions, located))
             .unwrap_or_else(|| {
-                let prior = &self.rooms[matched.room].motion_prior;
-                let belief = Belief::at(&matched.pose, prior, parameters.correlated_share);
-                (belief, 1)
+                let prior = &self.rooms[located.room].motion_prior;
+                (Belief::at(&located.pose, prior, correlated_share), 1)
             });
-        if agreeing >= parameters.views_to_agree {
-            state.belief = Some(belief);
-            state.room = Some(matched.room);
+        if agreeing >= needed {
+            state.belief = Some(belief.with_sensors_of(state.belief.as_ref()));
+            state.room = Some(located.room);
             state.is_placed = true;
-            state.located_ns = Some(frame.time_ns);
-            state.sight_ns = Some(frame.time_ns);
-            state.is_carried = true;
+            state.mark_located(frame.time_ns);
             return Correction::Replaced;
         }
 
         state.candidate = Some(FilterCandidate {
-            room: matched.room,
+            room: located.room,
             time_ns: frame.time_ns,
             sequence: frame.sequence,
             belief,
             agreeing,
+            needed,
         });
         Correction::Unused
     }
@@ -488,11 +618,11 @@ impl PoseFilter {
         candidate: &FilterCandidate,
         frame: &ViewObservation,
         motions: &Motions<'_>,
-        matched: &MatchedPose,
+        located: &LocatedPose,
     ) -> Option<(Belief, u32)> {
         let parameters = &self.parameters;
         let seconds = frame.time_ns.abs_diff(candidate.time_ns) as f64 * 1e-9;
-        if candidate.room != matched.room || seconds > parameters.max_candidate_s {
+        if candidate.room != located.room || seconds > parameters.max_candidate_s {
             return None;
         }
 
@@ -502,23 +632,11 @@ impl PoseFilter {
         let none = Motions::default();
         let motions = if is_last { motions } else { &none };
         let mut step = self.predicted(&candidate.belief, prior, seconds, motions);
-        let observed = step.located(&matched.pose, parameters);
+        let observed = self.observed(&step, located, 1.0);
         let agrees = step.squared_innovation(&observed) <= parameters.gate;
         agrees.then(|| {
             step.update(&observed, 1.0);
             (step.end(), candidate.agreeing + 1)
         })
-    }
-
-    /// Squared Mahalanobis length of the innovation of a located pose, if there is a belief in its
-    /// room.
-    fn squared_innovation(
-        &self,
-        state: &FilterState,
-        step: &Step,
-        matched: &MatchedPose,
-    ) -> Option<f64> {
-        let is_here = state.is_placed && state.room == Some(matched.room);
-        is_here.then(|| step.squared_innovation(&step.located(&matched.pose, &self.parameters)))
     }
 }

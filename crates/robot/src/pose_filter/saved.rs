@@ -14,7 +14,7 @@ const ROUNDING: f64 = 1e-5;
 
 /// The pose and velocity of a stream with their covariances, and its status.
 ///
-/// The pose is exact. Covariances are in single precision, without the correlation of pose and
+/// The pose is in double precision. Covariances are in single precision, without the correlation of pose and
 /// velocity. The odometry frame, the keyframe, candidates and learned errors of sensors are not saved.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
@@ -28,6 +28,8 @@ pub struct SavedState {
     sight_ns: Option<i64>,
     contradicted_ns: Option<i64>,
     unchanged_frames: u32,
+    is_carried: bool,
+    gravity_ns: Option<i64>,
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -59,6 +61,8 @@ impl FilterState {
             sight_ns: self.sight_ns,
             contradicted_ns: self.contradicted_ns,
             unchanged_frames: self.unchanged_frames,
+            is_carried: self.is_carried,
+            gravity_ns: self.gravity_ns,
         }
     }
 }
@@ -85,6 +89,8 @@ impl PoseFilter {
             sight_ns: saved.sight_ns,
             contradicted_ns: saved.contradicted_ns,
             unchanged_frames: saved.unchanged_frames,
+            is_carried: saved.is_carried,
+            gravity_ns: saved.gravity_ns,
             ..FilterState::in_room(saved.room)
         }
     }

@@ -2,10 +2,10 @@
 
 use nalgebra::{Matrix6, Vector6};
 
-use super::Belief;
 use super::belief::origin;
+use super::{Belief, FilterParameters, MeasuredGravity};
 use crate::tracking::{
-    Candidate, Drift, MatchedPose, MeasuredPose, OdometryDelta, PoseWithCovariance, Refusal,
+    BestMatch, Candidate, Drift, MeasuredPose, OdometryDelta, PoseWithCovariance, Refusal,
 };
 use crate::visual_odometry::VisualMotion;
 use seese3_core::geometry::{Pose, log};
@@ -17,18 +17,67 @@ pub struct ViewObservation {
     pub time_ns: i64,
     /// Sequence number set by the sender.
     pub sequence: u64,
-    /// The pose of the view, if its keypoints locate it.
-    pub matched: Option<MatchedPose>,
+    /// Poses of the stream's own camera by the views of this frame. The first one leads: only it may
+    /// start the tracking or replace a pose. Views of one frame have correlated errors: together
+    /// they count as one.
+    pub located: Vec<LocatedPose>,
+    /// The most similar mapped frame of all views.
+    pub best_match: Option<BestMatch>,
     /// How unlike the view is to the map, relative to the limit; infinite if unknown.
     pub novelty: f64,
-    /// Why the keypoints do not locate the view; empty if they do.
+    /// Why no view is located; empty if one is.
     pub unlocated: String,
-    /// Hash of the view's keypoints: equal for identical images. `None` without keypoints.
+    /// Equal for identical images of the stream's own camera. `None` for an image that shows
+    /// nothing.
     pub fingerprint: Option<u64>,
     /// The motion since the last frame by visual odometry, if its images agree.
     pub visual: Option<VisualMotion>,
     /// Camera pose from wheel odometry, in the odometry frame of that sensor.
     pub measured: Option<MeasuredPose>,
+    /// The direction of gravity, if it is measured.
+    pub gravity: Option<MeasuredGravity>,
+}
+
+impl ViewObservation {
+    /// A frame without any observation.
+    pub fn empty(time_ns: i64, sequence: u64) -> Self {
+        Self {
+            time_ns,
+            sequence,
+            located: Vec::new(),
+            best_match: None,
+            novelty: f64::INFINITY,
+            unlocated: String::new(),
+            fingerprint: None,
+            visual: None,
+            measured: None,
+            gravity: None,
+        }
+    }
+}
+
+/// How a view is located.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Source {
+    /// By keypoints that are matched with the map.
+    Matched,
+    /// By the most similar mapped frames.
+    Retrieved,
+}
+
+/// The pose of the stream's own camera, from one view.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LocatedPose {
+    /// The room, an index of the filter's rooms.
+    pub room: usize,
+    /// `world_from_camera`.
+    pub pose: PoseWithCovariance,
+    /// How the view is located.
+    pub source: Source,
+    /// Whether the view certainly shows the room. Other views only correct a pose that agrees.
+    pub is_of_room: bool,
+    /// The other camera of the view; `None` for the stream's own camera.
+    pub camera: Option<u32>,
 }
 
 /// Complete state of a stream.
@@ -65,6 +114,8 @@ pub struct FilterState {
     pub contradicted_ns: Option<i64>,
     /// Number of consecutive frames with the same image as the one before.
     pub unchanged_frames: u32,
+    /// Time of the last measured gravity, nanoseconds on the sensor's clock.
+    pub gravity_ns: Option<i64>,
 }
 
 /// Sum of the differences of wheel and visual odometry; older ones count less.
@@ -102,7 +153,7 @@ pub struct LastView {
     pub time_ns: i64,
     /// Sequence number.
     pub sequence: u64,
-    /// Hash of the view's keypoints; `None` without keypoints.
+    /// As [`ViewObservation::fingerprint`].
     pub fingerprint: Option<u64>,
 }
 
@@ -141,6 +192,8 @@ pub struct FilterCandidate {
     pub belief: Belief,
     /// Number of consecutive located poses that agree.
     pub agreeing: u32,
+    /// Number of poses that must agree.
+    pub needed: u32,
 }
 
 impl FilterState {
@@ -162,6 +215,7 @@ impl FilterState {
             disagreement: Disagreement::default(),
             contradicted_ns: None,
             unchanged_frames: 0,
+            gravity_ns: None,
         }
     }
 
@@ -226,6 +280,13 @@ impl FilterState {
         }
     }
 
+    /// Notes that a view was located.
+    pub(super) fn mark_located(&mut self, time_ns: i64) {
+        self.located_ns = Some(time_ns);
+        self.sight_ns = Some(time_ns);
+        self.is_carried = true;
+    }
+
     /// Drops a candidate that no located pose has supported for too long.
     pub(super) fn expire_candidate(&mut self, frame: &ViewObservation, max_s: f64) {
         let is_old = |candidate: &FilterCandidate| {
@@ -257,13 +318,13 @@ impl FilterState {
         }
     }
 
-    /// The keyframe of this frame, with the motion since. The frame itself becomes the keyframe of
-    /// later ones after `interval` frames.
+    /// The keyframe of this frame, with the motion since. The frame itself may become the keyframe of
+    /// later ones.
     pub(super) fn keyframe_with(
         &mut self,
         frame: &ViewObservation,
         motion: &PoseWithCovariance,
-        interval: u32,
+        parameters: &FilterParameters,
     ) -> KeyframeMark {
         let this = KeyframeMark {
             sequence: frame.sequence,
@@ -274,7 +335,9 @@ impl FilterState {
             ..keyframe
         });
 
-        let is_due = frame.sequence - reported.sequence >= u64::from(interval);
+        let frames = frame.sequence - reported.sequence;
+        let is_due = frames >= u64::from(parameters.keyframe_frames)
+            || log(&reported.since.pose).norm() >= parameters.keyframe_displacement;
         self.keyframe = Some(if is_due { this } else { reported });
         reported
     }
@@ -287,9 +350,9 @@ impl FilterCandidate {
             room: self.room,
             time_ns: self.time_ns,
             sequence: self.sequence,
-            latent: None,
             map_pose: self.belief.place(),
-            agreeing_anchors: self.agreeing,
+            agreeing: self.agreeing,
+            needed: self.needed,
         }
     }
 }

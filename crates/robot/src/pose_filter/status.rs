@@ -1,11 +1,17 @@
 //! The status of a stream, with its reason.
 
-use super::{FilterState, PoseFilter, ViewObservation};
+use super::gravity::Tilted;
+use super::{FilterCandidate, FilterState, PoseFilter, ViewObservation};
 use crate::tracking::{PLACE_DEVIATION_M, PoseWithCovariance, Status};
 
 impl PoseFilter {
     /// The status after a frame, with its reason.
-    pub(super) fn status(&self, state: &FilterState, frame: &ViewObservation) -> (Status, String) {
+    pub(super) fn status(
+        &self,
+        state: &FilterState,
+        frame: &ViewObservation,
+        tilted: Option<Tilted>,
+    ) -> (Status, String) {
         let place = state.belief.filter(|_| state.is_placed);
         let Some(place) = place.map(|belief| belief.place()) else {
             return self.unplaced(state, frame);
@@ -21,13 +27,14 @@ impl PoseFilter {
             return (Status::Lost, reason);
         }
 
-        match self.doubt(state, frame, &place) {
+        let doubt = self.doubt(state, frame, &place);
+        match doubt.or_else(|| tilted.map(|tilted| contradiction(&tilted))) {
             Some(reason) => (Status::Degraded, reason),
             None => {
                 let reason = if !self.parameters.fuse {
                     "the client has set the pose, and it is still certain"
-                } else if frame.unlocated.is_empty() {
-                    "recent views are located by their keypoints"
+                } else if state.unchanged_frames == 0 && frame.unlocated.is_empty() {
+                    "this view is located in the map"
                 } else if frame.visual.is_some() {
                     "visual odometry carries the pose since the last located view"
                 } else {
@@ -42,14 +49,14 @@ impl PoseFilter {
     fn unplaced(&self, state: &FilterState, frame: &ViewObservation) -> (Status, String) {
         if !self.parameters.fuse {
             let reason = "corrections are disabled: the stream needs a pose set by the client";
-            return (Status::Relocalizing, reason.to_owned());
+            return (Status::Lost, reason.to_owned());
         }
         match &state.candidate {
             Some(candidate) => {
-                let reason = format!("{} on a place", self.agreement(candidate.agreeing));
+                let reason = format!("{} on a place", agreement(candidate));
                 (Status::Relocalizing, reason)
             }
-            None => (Status::Lost, why_unlocated(frame)),
+            None => (Status::Lost, why_unlocated(state, frame)),
         }
     }
 
@@ -61,11 +68,17 @@ impl PoseFilter {
         place: &PoseWithCovariance,
     ) -> Option<String> {
         let parameters = &self.parameters;
-        if state.unchanged_frames >= parameters.max_unchanged_frames {
+        // While the stream's own camera is frozen, only another camera locates it.
+        let is_seen = frame.located.iter().any(|located| located.camera.is_some());
+        if state.unchanged_frames >= parameters.max_unchanged_frames && !is_seen {
             return Some(format!(
                 "{} consecutive images are identical: the camera is frozen, or a noise-free simulation stands still",
                 state.unchanged_frames + 1
             ));
+        }
+        let is_blind = frame.fingerprint.is_none() && frame.located.is_empty();
+        if is_blind && parameters.fuse {
+            return Some(why_unlocated(state, frame));
         }
         let since_s = |earlier: i64| frame.time_ns.abs_diff(earlier) as f64 * 1e-9;
         let contradicted_s = state.contradicted_ns.map(since_s);
@@ -77,7 +90,7 @@ impl PoseFilter {
             );
         }
         if let Some(candidate) = &state.candidate {
-            let agreement = self.agreement(candidate.agreeing);
+            let agreement = agreement(candidate);
             return Some(format!(
                 "{agreement} on a place other than the current map pose"
             ));
@@ -97,26 +110,36 @@ impl PoseFilter {
         let unlocated_s = state.sight_ns.map_or(0.0, since_s);
         (unlocated_s > parameters.max_unlocated_s).then(|| {
             let why = if parameters.fuse {
-                why_unlocated(frame)
+                why_unlocated(state, frame)
             } else {
                 "corrections are disabled".to_owned()
             };
             format!("no view has been located for {unlocated_s:.1} s: {why}")
         })
     }
-
-    fn agreement(&self, agreeing: u32) -> String {
-        format!(
-            "{agreeing} of {} located views agree",
-            self.parameters.views_to_agree
-        )
-    }
 }
 
-fn why_unlocated(frame: &ViewObservation) -> String {
-    if frame.unlocated.is_empty() {
-        "the view is identical to the one before, or contradicts the pose".to_owned()
-    } else {
+fn agreement(candidate: &FilterCandidate) -> String {
+    let FilterCandidate {
+        agreeing, needed, ..
+    } = candidate;
+    format!("{agreeing} of {needed} located views agree")
+}
+
+fn contradiction(tilted: &Tilted) -> String {
+    format!(
+        "measured gravity differs by {:.0}° from the estimated pose: the robot accelerates, or gravity_in_map or the \
+         sensor's axes are wrong",
+        tilted.angle_rad.to_degrees()
+    )
+}
+
+fn why_unlocated(state: &FilterState, frame: &ViewObservation) -> String {
+    if !frame.unlocated.is_empty() {
         frame.unlocated.clone()
+    } else if state.unchanged_frames > 0 {
+        "the view is identical to the one before".to_owned()
+    } else {
+        "the view contradicts the pose".to_owned()
     }
 }

@@ -1,17 +1,14 @@
-//! The map of a room, against which a tracker matches views.
+//! The map of a room, in which views are retrieved.
 
 use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView1, ArrayView2, Axis, s};
 
-use super::anchor_model::{
-    AnchorModel, AnchorModels, Blend, LOOKED_AT, Likeness, MapAnchor, calibrated_anchor,
-};
 use super::appearance::{Appearance, RoomAppearance};
+use super::blend::{Blend, BlendErrors, LOOKED_AT, Likeness, ViewErrors};
 use super::clock::frame_period_s;
-use super::motion_prior::MotionPrior;
-use super::{Error, PoseWithCovariance, room_errors};
-use seese3_core::adapter::{ErrorModel, MotionErrors, TEMPORAL_NEIGHBOURS};
+use super::{Error, PoseWithCovariance};
+use seese3_core::adapter::{ErrorModel, TEMPORAL_NEIGHBOURS};
 use seese3_core::index::{ExactIndex, Exclusion, Index, Neighbour};
 use seese3_core::navigation::Navigator;
 use seese3_core::room::{FrameId, Room};
@@ -52,11 +49,11 @@ impl<'a> MapQuery<'a> {
     }
 }
 
-/// Index of the mapped frames by PCA of the room's features, with its anchor models.
+/// Index of the mapped frames by PCA of the room's features, with the errors of the poses that it gives.
 struct AppearanceMap {
     appearance: Appearance,
     index: ExactIndex,
-    anchor_models: AnchorModels,
+    errors: ViewErrors,
 }
 
 impl AppearanceMap {
@@ -73,11 +70,8 @@ pub struct Map {
     error_model: Arc<ErrorModel>,
     index: ExactIndex,
     typical_distance: f64,
-    extent_m: f64,
-    motion_errors: MotionErrors,
     /// `None` if too few frames are mapped; the calibrated errors are then used.
-    anchor_model: Option<AnchorModel>,
-    motion_prior: MotionPrior,
+    errors: Option<BlendErrors>,
     pose_reader: Option<Arc<dyn PoseReader>>,
     by_appearance: Option<AppearanceMap>,
 }
@@ -95,8 +89,8 @@ pub struct MapMatch {
     pub out_of_distribution: f64,
     /// Whether the match is certain: hardly any frame of another room is that near.
     pub is_certain: bool,
-    /// Pose estimated from the nearest frames.
-    pub anchor: MapAnchor,
+    /// Pose estimated from the nearest frames, `world_from_camera`.
+    pub pose: PoseWithCovariance,
     /// Whether the frames were retrieved by raw feature, not by latent.
     pub is_by_feature: bool,
 }
@@ -106,7 +100,6 @@ impl Map {
     ///
     /// # Errors
     /// - [`Error::NotCalibrated`] if the adapter has no error model.
-    /// - [`Error::RoomErrors`] if the motion errors in this room give no valid error model.
     /// - [`Error::SmallMap`] if no mapped frame has a distinct one outside its temporal
     ///   neighborhood.
     pub fn new(navigator: Arc<Navigator>, mapped: &[FrameId]) -> Result<Self, Error> {
@@ -138,33 +131,26 @@ impl Map {
             });
         }
 
-        // Measure the adapter's errors in this room on its mapped frames, which have known poses.
-        let motion_errors = room_errors::motion_errors(&navigator, &error_model, mapped)
-            .map_err(Error::RoomErrors)?;
         let by_latent = Likeness {
             coordinates: &whitened,
             without_part: None,
             second_opinion: None,
         };
-        let anchor_model = AnchorModel::measured(&navigator, by_latent, mapped);
+        let errors = BlendErrors::measured(&navigator, by_latent, mapped);
 
         Ok(Self {
-            extent_m: extent_m(navigator.room(), mapped),
-            motion_prior: MotionPrior::of_path(navigator.room(), mapped),
             navigator,
             error_model,
             index,
             typical_distance,
-            motion_errors,
-            anchor_model,
+            errors,
             pose_reader: None,
             by_appearance: None,
         })
     }
 
     /// Adds retrieval by raw feature. `features` has shape (n, d), `mapped` holds the mapped
-    /// frames. Without enough frames for the PCA and the anchor models, retrieval by latent
-    /// remains.
+    /// frames. Without enough frames for the PCA and the errors, retrieval by latent remains.
     #[must_use]
     pub fn with_features(self, features: ArrayView2<'_, f32>, mapped: &[FrameId]) -> Self {
         let measured = || {
@@ -185,10 +171,8 @@ impl Map {
                 second_opinion: Some(&whitened),
             };
 
-            let anchor_models =
-                AnchorModel::measured_with_and_without(&self.navigator, likeness, mapped)?;
             Some(AppearanceMap {
-                anchor_models,
+                errors: ViewErrors::measured(&self.navigator, likeness, mapped)?,
                 index: ExactIndex::new(coordinates.view(), mapped),
                 appearance,
             })
@@ -201,8 +185,7 @@ impl Map {
         }
     }
 
-    /// Adds a localizer of this room; the tracker uses it for anchors of certain matches with a raw
-    /// feature.
+    /// Adds a localizer of this room. Streams use it for certain matches with a raw feature.
     #[must_use]
     pub fn with_pose_reader(self, pose_reader: Arc<dyn PoseReader>) -> Self {
         Self {
@@ -213,7 +196,7 @@ impl Map {
 
     /// Estimates the pose of a view with the localizer of this room; `None` without a localizer or
     /// a feature, or if the localizer gives no pose.
-    pub(super) fn pose_by_reader(&self, feature: Option<&[f32]>) -> Option<PoseWithCovariance> {
+    pub fn pose_by_reader(&self, feature: Option<&[f32]>) -> Option<PoseWithCovariance> {
         self.pose_reader.as_ref()?.read_pose(feature?)
     }
 
@@ -228,21 +211,6 @@ impl Map {
             map.appearance.memory_bytes() + map.index.memory_bytes()
         });
         self.index.memory_bytes() + by_appearance
-    }
-
-    /// Motion errors in this room: the calibrated ones, scaled by its mapped frames.
-    pub fn motion_errors(&self) -> &MotionErrors {
-        &self.motion_errors
-    }
-
-    /// Velocity statistics of the camera that mapped the room.
-    pub fn motion_prior(&self) -> &MotionPrior {
-        &self.motion_prior
-    }
-
-    /// Diagonal of the bounding box of the mapped camera positions, meters.
-    pub fn extent_m(&self) -> f64 {
-        self.extent_m
     }
 
     /// Matches a view with its `count` most similar mapped frames.
@@ -262,31 +230,30 @@ impl Map {
         let relative_distance = distance / self.typical_distance;
         let out_of_distribution = relative_distance / limits.out_of_distribution_ratio;
 
-        let blend = Blend::of(&self.navigator, &by_latent, query.latent, None);
+        let blend = Blend::of(&self.navigator, &by_latent, None);
         let by_feature = self.by_appearance.as_ref().zip(query.feature);
-        let (mut nearest, anchor) = match by_feature {
+        let (mut nearest, pose) = match by_feature {
             Some((map, feature)) => {
                 let alike = map.nearest(feature, count.max(LOOKED_AT));
 
                 // Ignore a latent that is out of distribution. Blurred, noisy or partly occluded
                 // images degrade latents more than features.
-                let second = Some(blend.pose());
-                let blend = Blend::of(&self.navigator, &alike, query.latent, second);
-                let models = &map.anchor_models;
-                let anchor = match out_of_distribution <= 1.0 {
-                    true => models.with_latent.anchor(&blend),
-                    false => models.without_latent.anchor(&blend.without_latent()),
+                let blend = Blend::of(&self.navigator, &alike, Some(&blend.pose));
+                let pose = if out_of_distribution <= 1.0 {
+                    map.errors.with_latent.pose(&blend)
+                } else {
+                    map.errors.without_latent.pose(&blend.without_latent())
                 };
 
                 let nearest = self.with_latent_distances(&alike, &whitened);
-                (nearest, anchor)
+                (nearest, pose)
             }
             None => {
-                let anchor = match &self.anchor_model {
-                    Some(model) => model.anchor(&blend),
-                    None => calibrated_anchor(&self.error_model, &blend),
+                let pose = match &self.errors {
+                    Some(errors) => errors.pose(&blend),
+                    None => blend.calibrated(&self.error_model),
                 };
-                (by_latent, anchor)
+                (by_latent, pose)
             }
         };
         nearest.truncate(count.max(1));
@@ -296,7 +263,7 @@ impl Map {
             distance,
             out_of_distribution,
             is_certain: relative_distance <= limits.certain_match_ratio,
-            anchor,
+            pose,
             is_by_feature: by_feature.is_some(),
         }
     }

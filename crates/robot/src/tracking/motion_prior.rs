@@ -9,6 +9,7 @@ use nalgebra::{Matrix3, Matrix6, SMatrix, Vector3};
 use super::clock::seconds_between;
 use seese3_core::geometry::{Twist, body_twist};
 use seese3_core::room::{FrameId, Room};
+use seese3_core::statistics::quantile;
 
 /// Covariance of a pose and a velocity.
 pub(crate) type Matrix12 = SMatrix<f64, 12, 12>;
@@ -21,6 +22,8 @@ const LONGEST_STEP_S: f64 = 0.5;
 const FEWEST_VELOCITIES: usize = 20;
 /// Range of the velocity's correlation time, seconds.
 const DURATION_RANGE_S: (f64, f64) = (0.05, 5.0);
+/// Largest multiple of the 90 % quantile of speeds that is a speed: a recording may jump.
+const FASTEST: f64 = 5.0;
 /// Variance added to each velocity component, (m/s)² and (rad/s)²: 1 cm/s and about 0.6°/s.
 const LEAST_VARIANCE: f64 = 1e-4;
 /// Default prior: 0.5 m/s and 0.5 rad/s along every axis, with a correlation time of 0.5 s.
@@ -73,10 +76,11 @@ pub(crate) struct Drift {
 impl MotionPrior {
     /// Estimates the prior from the mapped frames of a room, given in order.
     pub fn of_path(room: &Room, mapped: &[FrameId]) -> Self {
-        let steps: Vec<Option<(f64, Twist)>> = mapped
+        let mut steps: Vec<Option<(f64, Twist)>> = mapped
             .windows(2)
             .map(|pair| velocity(room, pair[0], pair[1]))
             .collect();
+        drop_jumps(&mut steps);
         let known: Vec<&(f64, Twist)> = steps.iter().flatten().collect();
         if known.len() < FEWEST_VELOCITIES {
             return Self::assumed();
@@ -188,6 +192,16 @@ fn velocity(room: &Room, from: FrameId, to: FrameId) -> Option<(f64, Twist)> {
     let motion = follows.then(|| body_twist(&room.poses()[from.row()], &room.poses()[to.row()]))?;
     let is_known = motion.is_unique_logarithm();
     is_known.then(|| (seconds, motion.scaled(seconds.recip())))
+}
+
+/// Drops velocities that are no motion of a camera.
+fn drop_jumps(steps: &mut [Option<(f64, Twist)>]) {
+    let speeds = steps.iter().flatten().map(|(_, velocity)| velocity.norm());
+    let fast = quantile(&speeds.collect::<Vec<f64>>(), 0.9).unwrap_or(0.0);
+    let is_motion = |(_, velocity): &(f64, Twist)| fast <= 0.0 || velocity.norm() <= FASTEST * fast;
+    for step in steps {
+        *step = step.filter(is_motion);
+    }
 }
 
 fn second_moment(velocities: impl Iterator<Item = Vector3<f64>>) -> Matrix3<f64> {

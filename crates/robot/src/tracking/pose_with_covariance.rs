@@ -1,8 +1,8 @@
 //! A Gaussian on SE(3): the pose of a camera and its uncertainty.
 
-use nalgebra::{Cholesky, Matrix6, Vector6};
+use nalgebra::{Matrix6, Vector6};
 
-use seese3_core::geometry::{Pose, Twist, adjoint, exp, left_jacobian_inverse, log};
+use seese3_core::geometry::{Pose, adjoint, log};
 
 /// Largest standard deviations of a usable pose: 2.5 of them are 0.5 m or 15°.
 pub(crate) const PLACE_DEVIATION_M: f64 = 0.2;
@@ -11,26 +11,11 @@ const PLACE_DEVIATION_RAD: f64 = 0.105;
 /// A pose with the covariance of its error δ in its own body frame: true = pose · exp(δ), δ ordered
 /// (v, ω), meters and radians.
 #[derive(Debug, Clone, Copy, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct PoseWithCovariance {
     /// `parent_from_camera`.
     pub pose: Pose,
     /// Symmetric and positive definite.
-    #[cfg_attr(
-        feature = "serde",
-        serde(with = "seese3_core::matrices::upper_triangle")
-    )]
     pub covariance: Matrix6<f64>,
-}
-
-/// Difference between a predicted and a measured pose.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Innovation {
-    /// log(pose⁻¹ measured).
-    pub twist: Vector6<f64>,
-    /// Squared Mahalanobis length of `twist` under the sum of both covariances: χ² with six degrees
-    /// of freedom if both covariances are correct.
-    pub squared_length: f64,
 }
 
 impl PoseWithCovariance {
@@ -43,29 +28,6 @@ impl PoseWithCovariance {
         Self {
             pose,
             covariance: Matrix6::from_diagonal(&Vector6::new(v, v, v, w, w, w)),
-        }
-    }
-
-    /// Prediction after a motion with error r, true = exp(motion + r); `noise` is the covariance of
-    /// r.
-    ///
-    /// Source: P' = Ad P Adᵀ + J_r Q J_rᵀ with Ad of exp(−ξ); Barfoot, State Estimation for
-    /// Robotics, ch. 8.
-    #[must_use]
-    pub fn moved(&self, motion: Twist, noise: &Matrix6<f64>) -> Self {
-        // The old error is carried into the new body frame by the adjoint of exp(−ξ).
-        let back = adjoint(&exp(&motion.reversed()));
-        let carried = back * self.covariance * back.transpose();
-
-        // J_r(ξ) = J_l(−ξ), found by inverting J_l⁻¹(−ξ), which can be inverted for |ω| < π.
-        let right = left_jacobian_inverse(&motion.reversed())
-            .try_inverse()
-            .unwrap_or_else(Matrix6::identity);
-        let covariance = symmetric(&(carried + right * noise * right.transpose()));
-
-        Self {
-            pose: self.pose * exp(&motion),
-            covariance,
         }
     }
 
@@ -92,42 +54,6 @@ impl PoseWithCovariance {
         }
     }
 
-    /// Innovation of a measured pose; `None` if the sum of the covariances is not positive
-    /// definite.
-    pub fn innovation(&self, measured: &PoseWithCovariance) -> Option<Innovation> {
-        let twist = log(&self.pose.inv_mul(&measured.pose)).to_vector();
-        let sum = Cholesky::new(self.covariance + measured.covariance)?;
-
-        Some(Innovation {
-            twist,
-            squared_length: twist.dot(&sum.solve(&twist)),
-        })
-    }
-
-    /// Kalman update with a measured pose, to first order in the innovation. The covariance uses
-    /// Joseph's form, which stays positive definite under rounding. If the sum of the covariances
-    /// is not positive definite, `self` is returned unchanged.
-    #[must_use]
-    pub fn corrected(&self, measured: &PoseWithCovariance) -> Self {
-        let Some(sum) = Cholesky::new(self.covariance + measured.covariance) else {
-            return *self;
-        };
-        let gain = self.covariance * sum.inverse();
-
-        let twist = log(&self.pose.inv_mul(&measured.pose)).to_vector();
-        let step = Twist::from_vector(&(gain * twist));
-
-        // Joseph's form: (I − K) P (I − K)ᵀ + K R Kᵀ.
-        let rest = Matrix6::identity() - gain;
-        let joseph = rest * self.covariance * rest.transpose()
-            + gain * measured.covariance * gain.transpose();
-
-        Self {
-            pose: self.pose * exp(&step),
-            covariance: symmetric(&joseph),
-        }
-    }
-
     /// The covariance in the order and frame of `geometry_msgs/PoseWithCovariance`: x, y, z, then
     /// rotations about x, y, z, about the parent's fixed axes. Row-major, meters and radians.
     ///
@@ -150,17 +76,8 @@ impl PoseWithCovariance {
 
     /// Whether the uncertainty is at most 0.5 m and 15°, at 2.5 standard deviations.
     pub fn tells_a_place(&self) -> bool {
-        self.is_within(1.0)
-    }
-
-    /// Whether the uncertainty is at most 1 m and 30°, at 2.5 standard deviations.
-    pub(super) fn hints_at_a_place(&self) -> bool {
-        self.is_within(2.0)
-    }
-
-    fn is_within(&self, factor: f64) -> bool {
-        self.position_deviation_m() <= factor * PLACE_DEVIATION_M
-            && self.rotation_deviation_rad() <= factor * PLACE_DEVIATION_RAD
+        self.position_deviation_m() <= PLACE_DEVIATION_M
+            && self.rotation_deviation_rad() <= PLACE_DEVIATION_RAD
     }
 
     /// The largest standard deviation of the position along any direction, meters.
@@ -187,10 +104,11 @@ fn symmetric(matrix: &Matrix6<f64>) -> Matrix6<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nalgebra::Vector3;
+    use nalgebra::{Cholesky, Vector3};
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
+    use seese3_core::geometry::{Twist, exp};
     use seese3_core::statistics::normal_deviates;
 
     fn twist(v: [f64; 3], w: [f64; 3]) -> Twist {
@@ -204,23 +122,23 @@ mod tests {
         Cholesky::new(*covariance).unwrap().l() * Vector6::from_iterator(normal_deviates(random, 6))
     }
 
-    /// Oracle: Monte Carlo with 10,000 samples: their covariance is the predicted one.
+    /// Oracle: Monte Carlo with 10,000 samples: their covariance is the composed one.
     #[test]
-    fn a_moved_covariance_is_that_of_drawn_motions() {
+    fn a_composed_covariance_is_that_of_drawn_motions() {
         let mut random = ChaCha8Rng::seed_from_u64(1);
         let start = PoseWithCovariance::known(Pose::translation(1.0, 2.0, 3.0), 0.02, 0.03);
-        let motion = twist([0.5, -0.2, 0.8], [0.1, 0.6, -0.2]);
-        let noise = Matrix6::from_diagonal(&Vector6::new(4e-4, 1e-4, 9e-4, 1e-4, 4e-4, 2e-4));
-        let found = start.moved(motion, &noise);
+        let motion = PoseWithCovariance {
+            pose: exp(&twist([0.5, -0.2, 0.8], [0.1, 0.6, -0.2])),
+            covariance: Matrix6::from_diagonal(&Vector6::new(4e-4, 1e-4, 9e-4, 1e-4, 4e-4, 2e-4)),
+        };
+        let found = start.composed(&motion);
 
         let count = 10_000;
         let mut sum = Matrix6::zeros();
         for _ in 0..count {
-            let from =
-                start.pose * exp(&Twist::from_vector(&drawn(&mut random, &start.covariance)));
-            let read = motion.to_vector() + drawn(&mut random, &noise);
-            let end = from * exp(&Twist::from_vector(&read));
-            let error = log(&found.pose.inv_mul(&end)).to_vector();
+            let [from, step] = [&start, &motion]
+                .map(|of| of.pose * exp(&Twist::from_vector(&drawn(&mut random, &of.covariance))));
+            let error = log(&found.pose.inv_mul(&(from * step))).to_vector();
             sum += error * error.transpose() / f64::from(count);
         }
 
@@ -230,20 +148,6 @@ mod tests {
             "off by {worst}: {sum} against {}",
             found.covariance
         );
-    }
-
-    /// Oracle: by hand. Two poses with equal covariance meet in the middle with half the variance.
-    /// The squared Mahalanobis length of a 2 m innovation with variances 1 + 1 is 2.
-    #[test]
-    fn two_equally_sure_poses_meet_in_the_middle() {
-        let ours = PoseWithCovariance::known(Pose::identity(), 1.0, 0.1);
-        let theirs = PoseWithCovariance::known(Pose::translation(2.0, 0.0, 0.0), 1.0, 0.1);
-        let met = ours.corrected(&theirs);
-
-        assert!((met.pose.translation.vector - Vector3::x()).norm() < 1e-12);
-        assert!((met.covariance - ours.covariance * 0.5).amax() < 1e-12);
-        assert!((ours.innovation(&theirs).unwrap().squared_length - 2.0).abs() < 1e-12);
-        assert!((ours.position_deviation_m() - 1.0).abs() < 1e-12);
     }
 
     /// Oracle: ROS's definition, by hand. For a camera rotated by 90° about z, the variance along
@@ -260,31 +164,5 @@ mod tests {
 
         let expected = Matrix6::from_diagonal(&Vector6::new(1.0, 4.0, 1.0, 0.1, 0.9, 0.1));
         assert!((found - expected).amax() < 1e-12, "{found}");
-    }
-
-    /// Oracle: the definition of positive definite, over many predictions and corrections.
-    #[test]
-    fn a_covariance_stays_positive_definite() {
-        let mut random = ChaCha8Rng::seed_from_u64(2);
-        let mut belief = PoseWithCovariance::known(Pose::identity(), 1e-6, 1e-6);
-        let noise = Matrix6::from_diagonal_element(1e-8);
-        for step in 0..5_000 {
-            let motion = Twist::from_vector(
-                &(0.3 * Vector6::from_iterator(normal_deviates(&mut random, 6))),
-            );
-            belief = belief.moved(motion, &noise);
-
-            if step % 7 == 0 {
-                belief = belief.corrected(&PoseWithCovariance {
-                    pose: belief.pose,
-                    covariance: Matrix6::from_diagonal_element(1e-9),
-                });
-            }
-
-            assert!(
-                Cholesky::new(belief.covariance).is_some(),
-                "after {step} steps"
-            );
-        }
     }
 }

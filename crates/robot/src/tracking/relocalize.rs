@@ -96,7 +96,7 @@ fn judged(rooms: Vec<RoomMatch>) -> Relocalization {
     // The margin is NaN when both distances are zero.
     let has_rival = margin.recip() > ROOM_RATIO || margin.is_nan();
     let is_far = best.out_of_distribution > 1.0;
-    let is_vague = !best.last.anchor.belief.tells_a_place();
+    let is_vague = !best.last.pose.tells_a_place();
     let reason = if is_far {
         format!(
             "the distance to the best room is {:.2} times the room's limit",
@@ -105,7 +105,7 @@ fn judged(rooms: Vec<RoomMatch>) -> Relocalization {
     } else if has_rival {
         format!("the second-best room is only {margin:.2} times as far as the best")
     } else if is_vague {
-        let belief = &best.last.anchor.belief;
+        let belief = &best.last.pose;
         format!(
             "the pose uncertainty in the best room is {:.2} m and {:.0}° (2.5 standard deviations)",
             2.5 * belief.position_deviation_m(),

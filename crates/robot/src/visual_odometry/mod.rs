@@ -212,6 +212,13 @@ impl VisualOdometry {
         }
     }
 
+    /// Notes a frame whose image tells nothing new, some seconds after the last one: the camera moves on
+    /// at its velocity.
+    pub fn skip(&mut self, seconds: f64) {
+        let predicted = self.pose * exp(&self.velocity.scaled(seconds));
+        self.miss(predicted);
+    }
+
     /// Notes a frame without a pose.
     fn miss(&mut self, predicted: Pose) {
         self.pose = predicted;

@@ -1,22 +1,21 @@
 //! The filter of located poses.
 
-use nalgebra::{Matrix6, Vector3, Vector6};
+use nalgebra::{Matrix6, Unit, Vector3, Vector6};
 
 use seese3_core::geometry::{Pose, PoseError, Twist, body_twist, exp};
-use seese3_core::room::FrameId;
 use seese3_robot::pose_filter::{
-    Belief, FilterParameters, FilterRoom, FilterState, MotionNoise, PoseFilter, ViewObservation,
+    Belief, FilterParameters, FilterRoom, FilterState, LocatedPose, MeasuredGravity, MotionNoise,
+    PoseFilter, Source, ViewObservation,
 };
 use seese3_robot::tracking::{
-    Drift, MatchedPose, MeasuredPose, MotionPrior, PoseWithCovariance, Refusal, Status, Update,
+    Drift, MeasuredPose, MotionPrior, PoseWithCovariance, Refusal, Status, Update,
 };
 use seese3_robot::visual_odometry::VisualMotion;
 
 const PERIOD_NS: i64 = 33_333_333;
 
-fn parameters(correlated_share: f64, correlation_range: f64) -> FilterParameters {
+fn parameters(correlation_range: f64) -> FilterParameters {
     FilterParameters {
-        correlated_share,
         correlation_range: [correlation_range; 2],
         ..FilterParameters::default()
     }
@@ -34,16 +33,22 @@ fn located(pose: Pose, deviation: f64) -> PoseWithCovariance {
     PoseWithCovariance::known(pose, deviation, deviation)
 }
 
+fn by_keypoints(pose: Pose, deviation: f64) -> LocatedPose {
+    LocatedPose {
+        room: 0,
+        pose: located(pose, deviation),
+        source: Source::Matched,
+        is_of_room: true,
+        camera: None,
+    }
+}
+
 fn view(number: u64, pose: Option<Pose>) -> ViewObservation {
     ViewObservation {
-        time_ns: number as i64 * PERIOD_NS,
-        sequence: number,
-        matched: pose.map(|pose| MatchedPose {
-            room: 0,
-            pose: located(pose, 0.005),
-            novelty: 0.5,
-            best_frame: FrameId(0),
-        }),
+        located: pose
+            .into_iter()
+            .map(|pose| by_keypoints(pose, 0.005))
+            .collect(),
         novelty: if pose.is_some() { 0.5 } else { 2.0 },
         unlocated: if pose.is_some() {
             String::new()
@@ -51,8 +56,7 @@ fn view(number: u64, pose: Option<Pose>) -> ViewObservation {
             "too few keypoints".to_owned()
         },
         fingerprint: Some(number),
-        visual: None,
-        measured: None,
+        ..ViewObservation::empty(number as i64 * PERIOD_NS, number)
     }
 }
 
@@ -76,9 +80,9 @@ fn correlated_errors_are_not_averaged_out() {
     let prior = MotionPrior::assumed();
     let pose = located(Pose::identity(), 0.01);
     let variance_after_two = |share: f64| {
-        let parameters = parameters(share, 1e9);
+        let parameters = parameters(1e9);
         let mut step = Belief::at(&pose, &prior, share).step(&prior, 0.0, &parameters);
-        step.update(&step.located(&pose, &parameters), 1.0);
+        step.update(&step.located(&pose, share), 1.0);
         step.end().place().covariance[(0, 0)]
     };
 
@@ -93,7 +97,7 @@ fn correlated_errors_are_not_averaged_out() {
 #[test]
 fn correlated_errors_decay_over_the_distance() {
     let prior = MotionPrior::assumed();
-    let parameters = parameters(0.7, 0.2);
+    let parameters = parameters(0.2);
     let left = |speed: f64| {
         let mut belief = Belief::at(&located(Pose::identity(), 0.01), &prior, 0.7);
         belief.correlated_error = Vector6::repeat(1.0);
@@ -115,20 +119,17 @@ fn correlated_errors_decay_over_the_distance() {
 #[test]
 fn correlated_errors_cancel_in_a_motion() {
     let prior = MotionPrior::assumed();
-    let parameters = parameters(1.0 - 1e-9, 1e9);
+    let share = 1.0 - 1e-9;
+    let parameters = parameters(1e9);
     let error = exp(&Twist {
         linear: Vector3::new(0.02, 0.0, 0.0),
         angular: Vector3::zeros(),
     });
     let (start, end) = (Pose::identity(), Pose::translation(0.0, 0.0, 0.05));
 
-    let belief = Belief::at(
-        &located(start * error, 0.02),
-        &prior,
-        parameters.correlated_share,
-    );
+    let belief = Belief::at(&located(start * error, 0.02), &prior, share);
     let mut step = belief.step(&prior, 0.1, &parameters);
-    step.update(&step.located(&located(end * error, 0.02), &parameters), 1.0);
+    step.update(&step.located(&located(end * error, 0.02), share), 1.0);
     let motion = step.motion();
     assert!(PoseError::between(&motion.pose, &end).translation_m < 1e-5);
     assert!(motion.covariance.diagonal().max() < 1e-8);
@@ -140,7 +141,7 @@ fn correlated_errors_cancel_in_a_motion() {
 #[test]
 fn errors_turn_with_the_camera() {
     let prior = MotionPrior::assumed();
-    let parameters = parameters(0.0, 1.0);
+    let parameters = parameters(1.0);
     let mut place = located(Pose::identity(), 1e-4);
     place.covariance[(0, 0)] = 1e-2;
     let turn = Pose::rotation(Vector3::z() * std::f64::consts::FRAC_PI_2);
@@ -161,7 +162,7 @@ fn errors_turn_with_the_camera() {
 
     // Located 2 cm along both of its axes, with the variance that y has: y moves by half of it.
     let seen = located(turn * Pose::translation(0.02, 0.02, 0.0), 0.1);
-    step.update(&step.located(&seen, &parameters), 1.0);
+    step.update(&step.located(&seen, 0.0), 1.0);
     let moved = turn.inverse() * step.end().pose.translation.vector;
     assert!((moved.y - 0.01).abs() < 1e-3, "{moved}");
     assert!(moved.x.abs() < 1e-3, "{moved}");
@@ -648,4 +649,177 @@ fn a_given_pose_starts_the_tracking() {
 
     let update = filter.observe(&mut state, &view(1, Some(path(1)))).unwrap();
     assert!(update.match_used && error_m(&update, &path(1)) < 0.01);
+}
+
+const DOWN: Vector3<f64> = Vector3::new(0.0, 1.0, 0.0);
+
+/// A frame with noise-free gravity, measured by a camera at this pose; the world's y axis points
+/// down.
+fn with_gravity(number: u64, pose: &Pose, deviation_rad: f64) -> ViewObservation {
+    let down = Unit::new_unchecked(DOWN);
+    ViewObservation {
+        gravity: Some(MeasuredGravity {
+            in_world: down,
+            in_camera: pose.rotation.inverse() * down,
+            deviation_rad,
+        }),
+        ..view(number, None)
+    }
+}
+
+fn turned(axis: Vector3<f64>, angle_rad: f64) -> Pose {
+    Pose::new(Vector3::new(1.0, 2.0, 3.0), axis * angle_rad)
+}
+
+/// A stream that starts at a level pose with these deviations, meters and radians, at frame 1.
+fn level_stream(filter: &PoseFilter, [m, rad]: [f64; 2]) -> (FilterState, Pose) {
+    let level = turned(DOWN, 0.7);
+    let state = filter.start(Some(&PoseWithCovariance::known(level, m, rad)));
+    (state, level)
+}
+
+/// Oracle: by hand. The estimate is level; the camera is rolled by 10° about its optical axis. A
+/// precise measurement of gravity corrects the roll and nothing else: the variances of heading and
+/// position stay.
+#[test]
+fn gravity_tells_the_tilt_and_nothing_else() {
+    let filter = filter();
+    let (mut state, level) = level_stream(&filter, [0.1, 0.2]);
+    let roll = Twist {
+        linear: Vector3::zeros(),
+        angular: Vector3::z() * 10_f64.to_radians(),
+    };
+    let truth = level * exp(&roll);
+    let update = filter
+        .observe(&mut state, &with_gravity(1, &truth, 1e-3))
+        .unwrap();
+
+    let found = update.map_pose.unwrap();
+    let error = body_twist(&found.pose, &truth).to_vector();
+    assert!(error.norm() < 1e-4, "{error}");
+    let deviation = |at: usize, axis: Vector3<f64>| {
+        let block = found.covariance.fixed_view::<3, 3>(at, at).into_owned();
+        (axis.transpose() * block * axis)[0].sqrt()
+    };
+    let down = truth.rotation.inverse() * DOWN;
+    assert!(deviation(3, Vector3::z()) < 2e-3);
+    // To first order in the correction.
+    assert!((deviation(3, down) / 0.2 - 1.0).abs() < 0.02);
+    assert!((deviation(0, Vector3::x()) - 0.1).abs() < 1e-3);
+}
+
+/// Oracle: by hand. A level pose has a deviation of 0.005 rad; gravity, with 0.02 rad, is 0.2 rad off:
+/// the squared innovation is 0.2² / (0.005² + 0.02²) = 94.118, or 10.219 times the gate of 9.21. The
+/// variance of gravity grows by 10.219² = 104.43, so it turns the pose by 0.2 · 25e-6 / 0.041797 =
+/// 0.0001196 rad. That is a contradiction; 0.02 rad is none.
+#[test]
+fn gravity_that_a_certain_pose_contradicts_counts_little() {
+    let filter = filter();
+    let turn = |angle_rad: f64| {
+        let (mut state, level) = level_stream(&filter, [0.005, 0.005]);
+        let pitch = Twist {
+            linear: Vector3::zeros(),
+            angular: Vector3::x() * angle_rad,
+        };
+        let frame = with_gravity(1, &(level * exp(&pitch)), 0.02);
+        let update = filter.observe(&mut state, &frame).unwrap();
+        let turn = body_twist(&level, &update.map_pose.unwrap().pose);
+        (turn.angular.x, update.reason)
+    };
+
+    let (turned_rad, reason) = turn(0.2);
+    assert!((turned_rad - 1.196e-4).abs() < 1e-6, "{turned_rad}");
+    assert!(reason.contains("gravity"), "{reason}");
+    assert!(!turn(0.02).1.contains("gravity"));
+}
+
+/// Oracle: by hand. A first direction with the variance of the pose corrects half of the error. One
+/// that follows after 1/30 s, with the correlation ρ = e^(−1/60), has (1 + ρ)/(1 − ρ) = 120 times the
+/// variance: two correct little more than one.
+#[test]
+fn directions_in_a_row_count_as_few() {
+    let filter = filter();
+    let (mut state, level) = level_stream(&filter, [0.001, 0.02]);
+    let roll = Twist {
+        linear: Vector3::zeros(),
+        angular: Vector3::z() * 0.02,
+    };
+    let truth = level * exp(&roll);
+    let mut corrected = |number| {
+        let frame = with_gravity(number, &truth, 0.02);
+        let update = filter.observe(&mut state, &frame).unwrap();
+        body_twist(&level, &update.map_pose.unwrap().pose).angular.z
+    };
+    let first = corrected(1);
+    assert!((first - 0.01).abs() < 1e-4, "{first}");
+    let second = corrected(2);
+    assert!(second - first < 5e-4, "{second}");
+}
+
+/// Oracle: the definition: an upside-down camera is half a turn off, about a horizontal axis.
+#[test]
+fn an_upside_down_camera_contradicts_gravity() {
+    let filter = filter();
+    let (mut state, level) = level_stream(&filter, [0.01, 0.01]);
+    let over = level * Pose::rotation(Vector3::z() * std::f64::consts::PI);
+    let update = filter
+        .observe(&mut state, &with_gravity(1, &over, 0.01))
+        .unwrap();
+    assert!(update.reason.contains("180°"), "{}", update.reason);
+}
+
+/// Oracle: by hand. Two views of one frame count as one: with the covariance of the pose, the two
+/// together have the information of a single view. A view of another camera corrects a stream whose
+/// own camera is frozen.
+#[test]
+fn views_of_one_frame_count_as_one() {
+    let filter = filter();
+    let deviation = |count: usize| {
+        let mut state = filter.start(Some(&located(Pose::identity(), 0.1)));
+        let one = by_keypoints(Pose::identity(), 0.01);
+        let frame = ViewObservation {
+            located: vec![one; count],
+            ..view(1, None)
+        };
+        let update = filter.observe(&mut state, &frame).unwrap();
+        update.map_pose.unwrap().position_deviation_m()
+    };
+    assert!((deviation(2) / deviation(1) - 1.0).abs() < 0.01);
+
+    let mut state = filter.start(Some(&located(Pose::identity(), 0.01)));
+    for number in 1..20 {
+        let other = LocatedPose {
+            camera: Some(0),
+            ..by_keypoints(Pose::identity(), 0.01)
+        };
+        let frame = ViewObservation {
+            located: vec![other],
+            fingerprint: Some(7),
+            unlocated: String::new(),
+            ..view(number, None)
+        };
+        let update = filter.observe(&mut state, &frame).unwrap();
+        assert_eq!(update.status, Status::Tracking, "{}", update.reason);
+        assert!(update.match_used);
+    }
+}
+
+/// Oracle: the contract of a stream that is not corrected: gravity does not turn its pose.
+#[test]
+fn gravity_does_not_correct_a_stream_without_fusion() {
+    let room = FilterRoom {
+        motion_prior: MotionPrior::assumed(),
+        extent_m: 3.0,
+    };
+    let parameters = FilterParameters {
+        fuse: false,
+        ..FilterParameters::default()
+    };
+    let filter = PoseFilter::new(vec![room], parameters).unwrap();
+    let (mut state, level) = level_stream(&filter, [0.1, 0.2]);
+    let rolled = level * Pose::rotation(Vector3::z() * 0.1);
+    let update = filter
+        .observe(&mut state, &with_gravity(1, &rolled, 1e-3))
+        .unwrap();
+    assert_eq!(update.map_pose.unwrap().pose, level);
 }

@@ -91,29 +91,19 @@ impl ContentDigest {
         let ErrorStatistics {
             frame_period_s,
             frame_noise,
-            motion_spread,
-            motion_errors,
-            anchor_errors,
+            match_errors,
             out_of_distribution_ratio,
             certain_match_ratio,
-            jump_distance,
-            map_pose_factor,
         } = statistics;
 
         self.numbers(frame_noise);
-        self.numbers(motion_spread);
-        for table in [&motion_errors.shapes, anchor_errors] {
-            for stratum in table.strata() {
-                self.numbers([&stratum.at, &stratum.gain]);
-                self.numbers(&stratum.covariance);
-            }
+        for stratum in match_errors.strata() {
+            self.numbers([&stratum.at]);
+            self.numbers(&stratum.covariance);
         }
         self.numbers([
-            &motion_errors.floor,
             out_of_distribution_ratio,
             certain_match_ratio,
-            jump_distance,
-            map_pose_factor,
             frame_period_s,
         ]);
     }

@@ -64,7 +64,7 @@ pub struct ServedNavigator {
     pub reader: Option<Arc<RoomReader>>,
     /// The keypoints of the room and their source, if it has any.
     pub keypoints: Option<ServedKeypoints>,
-    /// The reader of the most preferred fitted adapter, from which the map takes its anchors.
+    /// The reader of the most preferred fitted adapter, with which the map locates views.
     pub(super) tracking_reader: Option<Arc<RoomReader>>,
 }
 
@@ -76,7 +76,7 @@ impl LoadedRoom {
             .find(|served| served.adapter.name == adapter)
     }
 
-    /// The navigator of this adapter revision, if its trackers take their anchors from
+    /// The navigator of this adapter revision, if its streams locate views by
     /// `tracking_reader`.
     pub(super) fn under(
         &self,

@@ -187,7 +187,7 @@ impl RoomLoader {
         }
     }
 
-    /// Loads the room with one adapter. `tracking_reader` gives the trackers' anchors, if an
+    /// Loads the room with one adapter. `tracking_reader` locates the views of streams, if an
     /// adapter was fitted to the room.
     async fn navigator(
         &self,
@@ -305,7 +305,7 @@ fn log_audit(navigator: &Navigator, adapter: &str) {
 
 /// Builds the map of all frames of a room; `None` if the adapter is not calibrated, or, with a
 /// warning, if the room is too small for tracking. If an adapter was fitted to the room, its reader
-/// gives the anchors.
+/// locates the views of streams.
 fn map(
     navigator: &Arc<Navigator>,
     features: &Features,

@@ -9,7 +9,7 @@ use super::super::snapshot::{ServedNavigator, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::Pose;
 use seese3_robot::pose_filter::FilterParameters;
-use seese3_robot::tracking::{Drift, MeasuredPose, PoseWithCovariance, TrackerSettings};
+use seese3_robot::tracking::{Drift, MeasuredPose, PoseWithCovariance};
 
 /// Default standard deviation of a given pose, by axis: 0.1 m and 0.1 rad.
 const KNOWN: f64 = 0.1;
@@ -74,34 +74,6 @@ fn named_rooms(
     }
 }
 
-pub fn settings(
-    config: &pb::TrackConfig,
-    adapter: &seese3_core::adapter::Adapter,
-) -> Result<TrackerSettings, Error> {
-    let plain = TrackerSettings::of(adapter);
-
-    let pb::KeyframePolicy {
-        displacement,
-        frames,
-    } = config.keyframes.unwrap_or_default();
-
-    if displacement.is_some_and(|given| !(given.is_finite() && given > 0.0)) {
-        return Err(Error::invalid(
-            "keyframes.displacement",
-            "must be finite and above 0",
-        ));
-    }
-    if frames == Some(0) {
-        return Err(Error::invalid("keyframes.frames", "must be at least 1"));
-    }
-
-    Ok(TrackerSettings {
-        keyframe_frames: frames.unwrap_or(plain.keyframe_frames),
-        keyframe_displacement: displacement.unwrap_or(plain.keyframe_displacement),
-        fuse: is_fused(config.fusion)?,
-    })
-}
-
 /// Whether the map corrects the pose.
 pub fn is_fused(fusion: i32) -> Result<bool, Error> {
     match pb::Fusion::try_from(fusion) {
@@ -114,35 +86,29 @@ pub fn is_fused(fusion: i32) -> Result<bool, Error> {
     }
 }
 
-/// The parameters of a stream that tracks by keypoints alone.
+/// The parameters of a stream's filter.
 ///
 /// # Errors
-/// [`Error::Invalid`] on a field that is not valid, or that needs an adapter.
+/// [`Error::Invalid`] on a field that is not valid.
 pub fn parameters(config: &pb::TrackConfig) -> Result<FilterParameters, Error> {
-    let unused = |field: &str| {
-        let problem = "needs an adapter that can track in these rooms; leave it out";
-        Err(Error::invalid(field, problem))
-    };
     let pb::KeyframePolicy {
         displacement,
         frames,
     } = config.keyframes.unwrap_or_default();
-    if displacement.is_some() {
-        return unused("keyframes.displacement");
+    if displacement.is_some_and(|given| !(given.is_finite() && given > 0.0)) {
+        return Err(Error::invalid(
+            "keyframes.displacement",
+            "must be finite and above 0",
+        ));
     }
     if frames == Some(0) {
         return Err(Error::invalid("keyframes.frames", "must be at least 1"));
-    }
-    if config.gravity_in_map.is_some() {
-        return unused("gravity_in_map");
-    }
-    if !config.other_cameras.is_empty() {
-        return unused("other_cameras");
     }
 
     let default = FilterParameters::default();
     Ok(FilterParameters {
         keyframe_frames: frames.unwrap_or(default.keyframe_frames),
+        keyframe_displacement: displacement.unwrap_or(default.keyframe_displacement),
         fuse: is_fused(config.fusion)?,
         ..default
     })

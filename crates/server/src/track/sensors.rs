@@ -6,7 +6,7 @@ use super::super::Error;
 use super::configuration::{LONGEST_NAME, StreamFrames, clear_name, unnamed, within};
 use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::Pose;
-use seese3_robot::tracking::MeasuredGravity;
+use seese3_robot::pose_filter::MeasuredGravity;
 
 /// Maximum number of other cameras of a stream.
 const MOST_CAMERAS: usize = 8;

@@ -1,4 +1,4 @@
-//! A Track session: configuration, rooms, tracker state, and the answers to messages.
+//! A Track session: configuration, rooms, filter state, and the answers to messages.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,29 +9,27 @@ use super::super::embedding::{EmbeddedView, ImageKeypoints, StoredFrames, ViewEm
 use super::super::relocalization::maps;
 use super::super::snapshot::Snapshot;
 use super::Overtaken;
-use super::configuration::{StreamFrames, back_pressure, is_fused, parameters, rooms, settings};
+use super::configuration::{StreamFrames, back_pressure, is_fused, parameters, rooms};
 use super::engine::Engine;
 use super::keypoints::{StreamRooms, stream_camera};
 use super::rooms::{TrackedRoom, rooms_with_keypoints};
 use super::sealed::Sealed;
-use super::sensors::Sensors;
+use super::sensors::{NamedCamera, Sensors};
 use super::token::TokenKey;
 use super::wire;
 use pb::TrackRefusalReason as Reason;
 use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::Pose;
 use seese3_core::keypoints::{KeypointSource, Keypoints};
-use seese3_robot::front_end::{FrontEnd, ImageReading};
+use seese3_robot::front_end::{FrontEnd, ImageReading, StreamView};
 use seese3_robot::localization::NotLocated;
 use seese3_robot::pose_filter::ViewObservation;
-use seese3_robot::tracking::{
-    MeasuredPose, Observation, OtherView, PoseWithCovariance, Refusal, Status, Tracker, Update,
-};
+use seese3_robot::tracking::{MeasuredPose, PoseWithCovariance, Refusal, Status, Update};
 use seese3_robot::visual_odometry::OdometryParameters;
 
 const FIELD: &str = "config";
 
-/// A configured stream and its tracker state. The server keeps it only while the stream is open; a
+/// A configured stream and its filter's state. The server keeps it only while the stream is open; a
 /// resume token in the answers carries it.
 pub struct Session {
     /// Snapshot without rooms, for the image encoders. A stream may last for days and must not keep
@@ -93,18 +91,13 @@ impl Session {
                 other => other,
             })?;
 
-        // The state's latents and poses are valid only with the same adapter and rooms.
+        // The state's poses are valid only in the same rooms, and its room only under the same adapter.
         let state = sealed.opened_in(&session.rooms).ok_or_else(|| {
             let problem = "this server has another room or adapter than the token; start anew";
             Error::Precondition(format!("{field}: {problem}"))
         })?;
 
-        if !session.engine.resume(state, &session.rooms) {
-            return Err(Error::Precondition(format!(
-                "{field}: was sealed by a server of another version; start anew"
-            )));
-        }
-
+        session.engine.resume(&state);
         Ok(session)
     }
 
@@ -141,27 +134,27 @@ impl Session {
             ));
         }
 
-        let (rooms, engine) = match rooms_with_keypoints(snapshot, &config, was_of_keypoints)? {
-            Some(rooms) => {
-                let parameters = parameters(&config)?;
-                let engine = Engine::of_keypoints(&rooms, parameters, begins.as_ref());
-                (rooms, engine.ok_or(Error::Internal)?)
+        let parameters = parameters(&config)?;
+        let (rooms, maps) = match rooms_with_keypoints(snapshot, &config, was_of_keypoints)? {
+            Some(_) if !config.other_cameras.is_empty() => {
+                let problem = "needs an adapter that can track in these rooms; leave it out";
+                return Err(Error::invalid("other_cameras", problem));
             }
+            Some(rooms) => (rooms, None),
             None => {
                 let served = rooms(snapshot, &config)?;
-                let settings = settings(&config, &served[0].adapter.adapter)?;
-                let tracker = Tracker::new(maps(&served)?, settings)
-                    .map_err(|error| Error::Precondition(error.to_string()))?;
-                let state = Box::new(tracker.start(begins));
+                let maps = maps(&served)?;
                 let rooms = served.into_iter().map(TrackedRoom::under).collect();
-                (rooms, Engine::Adapter { tracker, state })
+                (rooms, Some(maps))
             }
         };
+        let engine = Engine::new(&rooms, maps, parameters, begins.as_ref())?;
 
-        let is_of_keypoints = matches!(engine, Engine::Keypoints { .. });
-        let odometry = is_of_keypoints.then(OdometryParameters::default);
+        let encoders = snapshot.without_rooms();
+        let has_keypoints = keypoint_source(&rooms, &encoders).is_some();
+        let odometry = has_keypoints.then(OdometryParameters::default);
         Ok(Self {
-            encoders: snapshot.without_rooms(),
+            encoders,
             rooms,
             engine,
             config,
@@ -186,15 +179,11 @@ impl Session {
 
     /// The first answer of a stream: adapter, room, frame names and keyframe policy in effect.
     pub fn started(&self) -> pb::TrackResponse {
-        let keyframes = match &self.engine {
-            Engine::Adapter { tracker, .. } => pb::KeyframePolicy {
-                displacement: Some(tracker.settings().keyframe_displacement),
-                frames: Some(tracker.settings().keyframe_frames),
-            },
-            Engine::Keypoints { filter, .. } => pb::KeyframePolicy {
-                displacement: None,
-                frames: Some(filter.parameters().keyframe_frames),
-            },
+        let parameters = self.engine.filter.parameters();
+        let displacement = parameters.keyframe_displacement;
+        let keyframes = pb::KeyframePolicy {
+            displacement: displacement.is_finite().then_some(displacement),
+            frames: Some(parameters.keyframe_frames),
         };
 
         let served = self.rooms[0].served.as_ref();
@@ -211,7 +200,7 @@ impl Session {
         self.answer(pb::track_response::Answer::Started(started))
     }
 
-    /// Answers a frame with a tracker update, or with a refusal if the frame is not valid. `waited`
+    /// Answers a frame with an update, or with a refusal if the frame is not valid. `waited`
     /// is the time since the frame's arrival.
     ///
     /// # Errors
@@ -233,7 +222,8 @@ impl Session {
         let answer = match self.observe(frame) {
             Ok(update) => {
                 let best_camera = update
-                    .best_camera
+                    .best_match
+                    .and_then(|best| best.camera)
                     .map_or_else(String::new, |number| self.sensors.camera_name(number));
                 let update = wire::update(&update, &self.frames, &self.rooms);
 
@@ -305,7 +295,9 @@ impl Session {
         // An invalid pose is refused; the stream and its state continue unchanged.
         let answer = match self.place_of(given) {
             Ok(place) => {
-                self.engine.set_pose(place);
+                self.engine.set_pose(&place);
+                self.last_pose = Some(place.pose);
+                self.is_lost = false;
                 pb::track_response::Answer::Acknowledged(pb::TrackAcknowledged {})
             }
             Err(error) => pb::track_response::Answer::Refusal(pb::TrackRefusal {
@@ -324,8 +316,10 @@ impl Session {
             .initial_pose
             .ok_or_else(|| Error::invalid(field, "is required"))?;
 
-        // The pose is in one room's world frame, so the room must be known.
-        let room = self.room().ok_or_else(|| {
+        // The pose is in one room's world frame, so the room must be known. A stream that is LOST
+        // among several rooms has none.
+        let is_known = !self.is_lost || self.rooms.len() == 1;
+        let room = self.room().filter(|_| is_known).ok_or_else(|| {
             Error::Precondition(format!(
                 "{field}: the room is not known yet; name it in the configuration"
             ))
@@ -349,23 +343,15 @@ impl Session {
         ))
     }
 
-    /// The source of the keypoints of images: the first of a room that this server can detect.
-    fn keypoint_source(&self) -> Option<&KeypointSource> {
-        let rooms = self.rooms.iter();
-        let mut sources = rooms.filter_map(|room| Some(&room.keypoints.as_ref()?.source));
-        sources.find(|source| self.encoders.keypoint_encoder(source).is_some())
-    }
-
-    /// The room in which views are matched; `None` for all rooms. A stream of keypoints that is LOST may
-    /// have been carried to another room.
+    /// The room in which views are compared; `None` for all rooms. A stream that is LOST may have been
+    /// carried to another room.
     fn room_to_match(&self) -> Option<usize> {
-        let is_lost = matches!(self.engine, Engine::Keypoints { .. }) && self.is_lost;
-        self.engine.room().filter(|_| !is_lost)
+        self.engine.room().filter(|_| !self.is_lost)
     }
 
     /// Reads the keypoints of the stream's own image.
     fn read(&mut self, image: &ImageKeypoints, time_ns: i64) -> Result<ImageReading, Error> {
-        let Some(source) = self.keypoint_source().cloned() else {
+        let Some(source) = keypoint_source(&self.rooms, &self.encoders).cloned() else {
             return Ok(ImageReading::default());
         };
         let room = self.room_to_match();
@@ -381,7 +367,7 @@ impl Session {
     /// An embedder of images, features and latents for the stream's adapter, which also detects
     /// keypoints if `detects` and a room has some that this server can detect.
     fn embedder(&self, detects: bool) -> Result<ViewEmbedder<'_>, Error> {
-        let source = self.keypoint_source().filter(|_| detects);
+        let source = keypoint_source(&self.rooms, &self.encoders).filter(|_| detects);
         Ok(ViewEmbedder {
             adapter: self.rooms[0].adapter().ok_or(Error::Internal)?,
             snapshot: &self.encoders,
@@ -391,15 +377,18 @@ impl Session {
     }
 
     /// Encodes the views of a frame's other cameras.
-    fn encoded_other_views(&self, views: Vec<pb::OtherView>) -> Result<Vec<OtherView>, Error> {
-        let mut seen: Vec<OtherView> = Vec::with_capacity(views.len());
+    fn encoded_other_views(
+        &self,
+        views: Vec<pb::OtherView>,
+    ) -> Result<Vec<(NamedCamera, EmbeddedView)>, Error> {
+        let mut seen: Vec<(NamedCamera, EmbeddedView)> = Vec::with_capacity(views.len());
         for (number, given) in views.into_iter().enumerate() {
             let field = format!("frame.other_views[{number}]");
             let camera = self
                 .sensors
                 .other_camera(&given.camera)
                 .map_err(|error| error.within(&field))?;
-            if seen.iter().any(|other| other.camera == camera.number) {
+            if seen.iter().any(|(other, _)| other.number == camera.number) {
                 return Err(Error::invalid(
                     format!("{field}.camera"),
                     "is the same camera twice",
@@ -407,30 +396,38 @@ impl Session {
             }
 
             let embedder = self.embedder(false)?;
-            let EmbeddedView {
-                latent,
-                feature,
-                is_blank,
-                keypoints: _,
-            } = embedder.embed(&format!("{field}.view"), given.view)?;
-            seen.push(OtherView {
-                camera: camera.number,
-                camera_from_other: camera.camera_from_other,
-                latent,
-                feature,
-                is_blank,
-            });
+            let view = embedder.embed(&format!("{field}.view"), given.view)?;
+            seen.push((camera, view));
         }
 
         Ok(seen)
     }
 
     fn observe(&mut self, frame: pb::TrackFrame) -> Result<Update, Refused> {
-        let (update, contradicted) = match self.engine {
-            Engine::Adapter { .. } => self.observe_latent(frame),
-            Engine::Keypoints { .. } => self.observe_keypoints(frame),
-        }?;
+        // A refused frame must not change what later views are compared with.
+        let Engine { filter, state, .. } = &self.engine;
+        filter.check(state, frame.timestamp_ns, frame.sequence)?;
 
+        let measured = self.measured(frame.odometry.clone())?;
+        let gravity = frame
+            .gravity
+            .as_ref()
+            .map(|given| self.sensors.gravity(given))
+            .transpose()
+            .map_err(|error| refused(Reason::Gravity)(error.within("frame.gravity")))?;
+        let (observed, contradicted) = match self.engine.retrieval {
+            Some(_) => self.retrieved(frame),
+            None => self.detected(frame).map(|observed| (observed, None)),
+        }
+        .map_err(refused(Reason::View))?;
+        let observation = ViewObservation {
+            measured,
+            gravity,
+            ..observed
+        };
+
+        let Engine { filter, state, .. } = &mut self.engine;
+        let update = filter.observe(state, &observation)?;
         let tracked = update
             .map_pose
             .filter(|_| update.status == Status::Tracking && update.match_used);
@@ -445,101 +442,52 @@ impl Session {
         })
     }
 
-    /// Passes a frame to the tracker of the adapter. Also returns the camera that the keypoints
-    /// contradict.
-    fn observe_latent(
+    /// The observation of a frame by the most similar mapped frames, and by the keypoints of an image.
+    /// Also returns the camera that the keypoints contradict.
+    fn retrieved(
         &mut self,
         frame: pb::TrackFrame,
-    ) -> Result<(Update, Option<NotLocated>), Refused> {
-        let pb::TrackFrame {
-            timestamp_ns,
-            sequence,
-            view,
-            with_token: _,
-            odometry,
-            gravity,
-            other_views,
-        } = frame;
-
-        let EmbeddedView {
-            latent,
-            feature,
-            is_blank,
-            keypoints,
-        } = self
-            .embedder(true)
-            .and_then(|embedder| embedder.embed("frame.view", view))
-            .map_err(refused(Reason::View))?;
-        let matched = match keypoints {
-            Some(image) if !is_blank => {
-                let read = self.read(&image, timestamp_ns);
-                read.map_err(refused(Reason::View))?
+    ) -> Result<(ViewObservation, Option<NotLocated>), Error> {
+        let own = self.embedder(true)?.embed("frame.view", frame.view)?;
+        let others = self.encoded_other_views(frame.other_views)?;
+        let image = match &own.keypoints {
+            Some(image) if !own.is_blank => self.read(image, frame.timestamp_ns)?,
+            _ => {
+                self.front_end.skip(frame.timestamp_ns);
+                ImageReading::default()
             }
-            _ => ImageReading::default(),
-        };
-        let other_views = self
-            .encoded_other_views(other_views)
-            .map_err(refused(Reason::View))?;
-        let measured = self.measured(odometry)?;
-        let gravity = gravity
-            .map(|given| self.sensors.gravity(&given))
-            .transpose()
-            .map_err(|error| refused(Reason::Gravity)(error.within("frame.gravity")))?;
-
-        let observation = Observation {
-            time_ns: timestamp_ns,
-            sequence,
-            latent,
-            feature,
-            matched: matched.matched,
-            is_blank,
-            measured,
-            gravity,
-            other_views,
         };
 
-        let Engine::Adapter { tracker, state } = &mut self.engine else {
-            return Err(Refused::Server(Error::Internal));
-        };
-        let update = tracker.observe(state, &observation)?;
-        let contradicted = matched.why_not.filter(NotLocated::is_of_camera);
-        Ok((update, contradicted))
+        let cameras = std::iter::once((None, &own)).chain(others.iter().map(|(camera, view)| {
+            let other = (camera.number, camera.camera_from_other);
+            (Some(other), view)
+        }));
+        let views: Vec<StreamView<'_>> = cameras
+            .map(|(other, view)| StreamView {
+                other,
+                latent: view.latent.view(),
+                feature: view.feature.as_deref(),
+                is_blank: view.is_blank,
+            })
+            .collect();
+        let room = self.room_to_match();
+        let retrieval = self.engine.retrieval.as_mut().ok_or(Error::Internal)?;
+        let found = retrieval.front_end.read(&views, &retrieval.maps, room);
+        let contradicted = image.why_not.filter(NotLocated::is_of_camera);
+        let observed = found.observation(&image, frame.timestamp_ns, frame.sequence);
+        Ok((observed, contradicted))
     }
 
-    /// Passes a frame to the filter of located views.
-    fn observe_keypoints(
-        &mut self,
-        frame: pb::TrackFrame,
-    ) -> Result<(Update, Option<NotLocated>), Refused> {
-        let unused = |reason: Reason, field: &str| {
-            let problem = "needs an adapter that can track in this room; leave it out";
-            refused(reason)(Error::invalid(field, problem))
-        };
-        if frame.gravity.is_some() {
-            return Err(unused(Reason::Gravity, "frame.gravity"));
-        }
+    /// The observation of a frame by the keypoints of its image alone.
+    fn detected(&mut self, frame: pb::TrackFrame) -> Result<ViewObservation, Error> {
         if !frame.other_views.is_empty() {
-            return Err(unused(Reason::View, "frame.other_views"));
+            let problem = "needs an adapter that can track in this room; leave it out";
+            return Err(Error::invalid("frame.other_views", problem));
         }
-
-        // A refused frame must not change what later images are compared with.
-        if let Engine::Keypoints { filter, state } = &self.engine {
-            filter.check(state, frame.timestamp_ns, frame.sequence)?;
-        }
-        let measured = self.measured(frame.odometry)?;
-        let image = self.detected(frame.view).map_err(refused(Reason::View))?;
-        let read = self
-            .read(&image, frame.timestamp_ns)
-            .map_err(refused(Reason::View))?;
-        let observation = ViewObservation {
-            measured,
-            ..read.observation(frame.timestamp_ns, frame.sequence, image.fingerprint())
-        };
-
-        let Engine::Keypoints { filter, state } = &mut self.engine else {
-            return Err(Refused::Server(Error::Internal));
-        };
-        Ok((filter.observe(state, &observation)?, None))
+        let image = self.keypoints_of(frame.view)?;
+        let read = self.read(&image, frame.timestamp_ns)?;
+        let fingerprint = image.fingerprint();
+        Ok(read.observation(frame.timestamp_ns, frame.sequence, fingerprint))
     }
 
     /// The camera pose of another sensor's odometry.
@@ -554,15 +502,14 @@ impl Session {
     }
 
     /// The keypoints of an image, for a stream without an adapter.
-    fn detected(&self, view: Option<pb::View>) -> Result<ImageKeypoints, Error> {
+    fn keypoints_of(&self, view: Option<pb::View>) -> Result<ImageKeypoints, Error> {
         let Some(pb::view::View::Image(image)) = view.and_then(|view| view.view) else {
             return Err(Error::invalid(
                 "frame.view",
                 "must be an image: the stream has no adapter for features and latents",
             ));
         };
-        let encoder = self
-            .keypoint_source()
+        let encoder = keypoint_source(&self.rooms, &self.encoders)
             .and_then(|source| self.encoders.keypoint_encoder(source))
             .ok_or(Error::Internal)?;
         let pixels = encoder.decoded("frame.view.image", &image)?;
@@ -577,14 +524,25 @@ impl Session {
     }
 
     fn answer(&self, answer: pb::track_response::Answer) -> pb::TrackResponse {
-        // The token carries the whole state, so that the stream can resume after a restart or on
-        // another server.
-        let sealed = Sealed::new(&self.config, self.engine.state(), &self.rooms);
+        // The token carries pose, velocity and times, so that the stream can resume after a restart or
+        // on another server.
+        let sealed = Sealed::new(&self.config, self.engine.state.saved(), &self.rooms);
         pb::TrackResponse {
             answer: Some(answer),
             resume_token: self.key.seal(&sealed.to_bytes()),
         }
     }
+}
+
+/// The source of the keypoints of images: the first of a room that this server can detect.
+fn keypoint_source<'a>(
+    rooms: &'a [TrackedRoom],
+    encoders: &Snapshot,
+) -> Option<&'a KeypointSource> {
+    let mut sources = rooms
+        .iter()
+        .filter_map(|room| Some(&room.keypoints.as_ref()?.source));
+    sources.find(|source| encoders.keypoint_encoder(source).is_some())
 }
 
 fn without_token(answer: pb::track_response::Answer) -> pb::TrackResponse {
@@ -611,13 +569,12 @@ enum Refused {
     Server(Error),
 }
 
-/// The tracker refuses late and duplicate frames. A refused frame does not change the state.
+/// The filter refuses late and duplicate frames. A refused frame does not change the state.
 impl From<Refusal> for Refused {
     fn from(refusal: Refusal) -> Self {
         let reason = match &refusal {
             Refusal::Late { .. } => Reason::Late,
             Refusal::Duplicate { .. } => Reason::Duplicate,
-            Refusal::View(_) => Reason::View,
         };
         Self::Frame(reason, refusal.to_string())
     }

@@ -1,4 +1,4 @@
-//! Converts tracker updates to wire messages.
+//! Converts updates to wire messages.
 
 use super::super::convert;
 use super::configuration::StreamFrames;
@@ -52,7 +52,7 @@ pub fn update(update: &Update, frames: &StreamFrames, rooms: &[TrackedRoom]) -> 
         reason: update.reason.clone(),
         out_of_distribution: update.out_of_distribution,
         room: known.map(|room| room.revision.clone()),
-        best_match: best_match.map(|(room, best)| rooms[room].retrieved(best)),
+        best_match: best_match.map(|best| rooms[best.room].retrieved(best.frame)),
         match_used: update.match_used,
         match_surprise: update.surprise,
         elapsed_ns: 0,
@@ -63,8 +63,8 @@ pub fn update(update: &Update, frames: &StreamFrames, rooms: &[TrackedRoom]) -> 
                 room: Some(rooms[candidate.room].revision.clone()),
                 map_from_camera: Some(pose(&candidate.map_pose.pose, &names.map, &names.camera)),
                 sequence: candidate.sequence,
-                agreed: candidate.agreeing_anchors,
-                needed: update.anchors_needed,
+                agreed: candidate.agreeing,
+                needed: candidate.needed,
             }),
         odom_from_base: camera_from_base.map(|camera_from_base| {
             let odom_from_base = odom_from_camera * camera_from_base;
@@ -82,7 +82,7 @@ pub fn update(update: &Update, frames: &StreamFrames, rooms: &[TrackedRoom]) -> 
     }
 }
 
-/// The odometry pose in the stream's odometry frame. The tracker's odometry starts at the camera;
+/// The odometry pose in the stream's odometry frame. The filter's odometry starts at the camera;
 /// if the base is known, the stream's odometry starts at the base.
 fn odom_of_stream(odom: &PoseWithCovariance, frames: &StreamFrames) -> PoseWithCovariance {
     match frames.base_from_camera {

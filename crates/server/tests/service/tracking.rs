@@ -195,29 +195,53 @@ async fn a_camera_in_a_mapped_room_is_followed() {
     assert!(begins_at.norm() < 1e-12 && first.body_velocity.is_none());
 }
 
-/// Oracle: a stream that was never cut, bit by bit, tokens and all; the second server shares the
-/// store's content and the key, and nothing else.
+/// Oracle: the contract. A token holds the map pose to the bit: two servers with the same content and
+/// key answer the same from it, bit by bit, tokens and all. The answers are nearly those of the stream
+/// that was never cut. The odometry begins anew.
 #[tokio::test]
-async fn a_stream_goes_on_at_another_server_as_if_it_had_never_been_cut() {
+async fn a_stream_goes_on_at_another_server() {
     let one = server(KEY).await;
     let two = server(KEY).await;
 
     let whole = answers(&one, followed(config(), 0..60)).await.unwrap();
-
-    for cut in [1, 7, 31, 60] {
+    for cut in [1, 15, 31, 60] {
         let first = answers(&one, followed(config(), 0..cut)).await.unwrap();
-
-        assert_eq!(first, whole[..=cut], "up to {cut}");
+        assert!(first == whole[..=cut], "up to {cut}");
+        assert!(first[cut].resume_token.len() < 600, "{cut}");
 
         let rest = followed(resume(first[cut].resume_token.clone()), cut..60);
+        let here = answers(&one, rest.clone()).await.unwrap();
+        let there = answers(&two, rest).await.unwrap();
+        assert!(here == there, "from {cut}");
+        is_nearly(&here[1..], &whole[cut + 1..]);
+        if let Some(next) = here.get(1) {
+            let odom = pose_of(update(next).odom_from_camera.as_ref());
+            assert!(odom.translation.vector.norm() < 0.05, "{cut}");
+        }
+    }
+}
 
-        let second = answers(&two, rest).await.unwrap();
-        assert_eq!(second[1..], whole[cut + 1..], "from {cut}");
+fn pose_of(given: Option<&pb::Pose>) -> Pose {
+    convert::pose(given.unwrap()).unwrap()
+}
+
+/// Checks that updates have the map poses of others to 1 cm, if both have one.
+pub fn is_nearly(found: &[pb::TrackResponse], expected: &[pb::TrackResponse]) {
+    assert_eq!(found.len(), expected.len());
+    for (found, expected) in found.iter().zip(expected) {
+        let [found, expected] = [found, expected].map(update);
+        assert_eq!(found.sequence, expected.sequence);
+        let both = (&found.map_from_camera, &expected.map_from_camera);
+        if let (Some(found), Some(expected)) = both {
+            let [found, expected] = [found, expected].map(|pose| pose_of(Some(pose)));
+            let error = PoseError::between(&found, &expected);
+            assert!(error.translation_m < 0.01, "{error:?}");
+        }
     }
 }
 
 /// Oracle: the stream that brings a token with every answer: the others answer the same, with
-/// tokens where they were asked for, and go on from them.
+/// tokens where they were asked for, and are resumed from them.
 #[tokio::test]
 async fn tokens_come_when_they_are_asked_for() {
     let server = server(KEY).await;
@@ -259,9 +283,7 @@ async fn tokens_come_when_they_are_asked_for() {
         let rest = [vec![begin(resumed)], (13..20).map(seen).collect()].concat();
         let rest = answers(&server, rest).await.unwrap();
         assert_eq!(rest.len(), 8);
-        for (rest, whole) in rest[1..].iter().zip(&whole[14..]) {
-            assert_eq!(rest.answer, whole.answer);
-        }
+        is_nearly(&rest[1..], &whole[14..]);
     }
 }
 
@@ -368,10 +390,10 @@ async fn late_and_duplicate_frames_are_refused_and_leave_no_trace() {
     }
 }
 
-/// Oracle: the promise: a view that jumps is LOST, another place is never believed, and the
-/// covariance grows meanwhile.
+/// Oracle: the contract: views of another place are not TRACKING after 0.1 s. The pose is continued,
+/// and is less certain than before.
 #[tokio::test]
-async fn a_camera_in_another_place_is_lost_and_less_and_less_sure() {
+async fn a_camera_in_another_place_is_not_tracked() {
     let server = server(KEY).await;
     let moon = place("moon", 77).1;
 
@@ -402,27 +424,14 @@ async fn a_camera_in_another_place_is_lost_and_less_and_less_sure() {
     let found = answers(&server, requests.collect()).await.unwrap();
     assert_eq!(update(&found[20]).status(), pb::TrackStatus::Tracking);
 
-    let jumped = update(&found[21]);
-    assert_eq!(jumped.status(), pb::TrackStatus::Lost, "{}", jumped.reason);
-
-    let mut before = 0.0;
-    for answer in &found[21..] {
+    for answer in &found[25..] {
         let update = update(answer);
-
-        // Made-up places are few, and this adapter is not sure of them: it may look for a place,
-        // but believes none.
-        assert!(
-            [pb::TrackStatus::Lost, pb::TrackStatus::Relocalizing].contains(&update.status()),
-            "{}",
-            update.reason
-        );
-
-        if update.status() == pb::TrackStatus::Lost {
-            let volume = matrix(&update.map_from_camera_covariance).determinant();
-            assert!(volume > before, "the covariance did not grow");
-            before = volume;
-        }
+        let reason = &update.reason;
+        assert_eq!(update.status(), pb::TrackStatus::Degraded, "{reason}");
+        assert!(update.out_of_distribution > 1.0, "{reason}");
     }
+    let volume = |row: usize| matrix(&update(&found[row]).map_from_camera_covariance).determinant();
+    assert!(volume(40) > volume(20));
 }
 
 /// Oracle: the order of messages, by hand.
@@ -629,7 +638,10 @@ async fn a_room_that_is_not_named_is_found() {
             .into_iter()
             .chain((4..40).map(|row| seen_of(room, row)))
             .collect();
-        assert_eq!(answers(&server, rest).await.unwrap()[1..], found[5..]);
+        let rest = answers(&server, rest).await.unwrap();
+        let last = update(&rest[36]);
+        assert_eq!(last.status(), pb::TrackStatus::Tracking, "{}", last.reason);
+        assert_eq!(last.room.as_ref().unwrap().name, room);
     }
 }
 

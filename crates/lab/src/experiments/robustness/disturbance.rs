@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use seese3_core::geometry::Pose;
 use seese3_core::image::RgbImage;
 use seese3_core::statistics::normal_deviates;
-use seese3_robot::tracking::MeasuredGravity;
+use seese3_robot::pose_filter::MeasuredGravity;
 
 /// Image width for which blurs are stated, pixels; blurs scale with the image width.
 const STATED_WIDTH: f64 = 640.0;

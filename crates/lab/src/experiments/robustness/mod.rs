@@ -7,33 +7,20 @@
 mod disturbance;
 
 use nalgebra::{Unit, Vector3};
-use ndarray::ArrayView2;
 use serde::{Serialize, Serializer};
 
 use seese3_core::geometry::Pose;
 use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::HoldOut;
-use seese3_robot::tracking::{
-    InitialPose, Observation, Played, Replay, Status, joined, period_ns, replay_frames,
-};
+use seese3_robot::tracking::Status;
 
 pub use disturbance::{Disturbance, Extent};
 
-use super::Error;
-use super::odometry::{StatusShares, TrackedRoom};
-use super::tracking_scores::TrackingScores;
+use super::replay::{Replay, joined, period_ns};
+use super::tracking_scores::{StatusShares, TrackingScores};
 
 /// Maximum number of frames for which a camera is frozen or blank.
 const MOST_DISTURBED: usize = 60;
-
-/// Views of a disturbed camera, one per tracked frame of a room.
-#[derive(Debug, Clone, Copy)]
-pub struct DisturbedViews<'a> {
-    /// Raw features, shape (tracked frames, d).
-    pub features: ArrayView2<'a, f32>,
-    /// Whether each disturbed image is blank, one flag per tracked frame.
-    pub is_blank: &'a [bool],
-}
 
 /// Tracking results under one disturbance, of one room or of several rooms together.
 #[derive(Debug, Clone, Serialize)]
@@ -122,7 +109,7 @@ impl Part {
 
 /// The down direction in a recording's world frame: the signed world axis nearest to the mean
 /// y axis of the camera, which points down when the camera is level.
-fn down_of(poses: &[Pose]) -> Unit<Vector3<f64>> {
+pub(super) fn down_of(poses: &[Pose]) -> Unit<Vector3<f64>> {
     let sum: Vector3<f64> = poses.iter().map(|pose| pose.rotation * Vector3::y()).sum();
     let axis = sum.iamax();
     Unit::new_unchecked(Vector3::ith(axis, sum[axis].signum()))
@@ -228,48 +215,6 @@ pub(super) fn scored(
             Extent::Part => slowest(noticed.into_iter()),
         },
     }
-}
-
-/// Tracks the disturbed streams of a room by an adapter.
-///
-/// # Errors
-/// [`Error::Adapter`] when the features are not those of the tracker's adapter.
-pub fn evaluate(
-    room: &TrackedRoom<'_>,
-    hold_out: HoldOut,
-    disturbance: Disturbance,
-    views: DisturbedViews<'_>,
-) -> Result<DisturbedTracking, Error> {
-    let adapter = room.tracker().maps()[0].navigator().adapter().clone();
-    let latents = adapter.embed(views.features)?;
-
-    let down = down_of(room.room().poses());
-    let played = |frame: &PlannedFrame| Played {
-        frame: Observation {
-            feature: Some(views.features.row(frame.view).to_vec()),
-            is_blank: frame.is_disturbed && views.is_blank[frame.view],
-            gravity: disturbance.gravity(&frame.truth, down),
-            ..Observation::new(
-                frame.time_ns,
-                frame.sequence,
-                latents.row(frame.view).to_owned(),
-            )
-        },
-        truth: frame.truth,
-    };
-
-    let streams = plan(room.room(), hold_out, disturbance);
-    let replayed = streams.into_iter().map(|stream| {
-        let played: Vec<Played> = stream.frames.iter().map(played).collect();
-        let replay = replay_frames(room.tracker(), &played, InitialPose::Given);
-        (stream, replay)
-    });
-    Ok(scored(
-        room.room(),
-        disturbance,
-        replayed.collect(),
-        &|view| *room.most_alike(views.features.row(view)),
-    ))
 }
 
 /// A frame of the disturbed stream.

@@ -1,41 +1,14 @@
-//! Replays recordings through a tracker and compares its output with the ground truth.
+//! A stream that was replayed: ground truth and answers.
 
-use ndarray::ArrayView2;
-
-use super::clock::{ASSUMED_PERIOD_S, seconds_between};
-use super::{Observation, PoseWithCovariance, State, Status, Tracker, Update};
 use seese3_core::geometry::{Pose, PoseError, body_twist, log};
 use seese3_core::room::{FrameId, Room};
 use seese3_core::trajectory::Trajectory;
+use seese3_robot::tracking::{ASSUMED_PERIOD_S, Status, Update, seconds_between};
 
-/// Standard deviation per axis of a given initial pose, meters and radians.
-const INITIAL_DEVIATION: f64 = 1e-3;
 /// Largest position error of a successful relocalization, meters.
 const FOUND_WITHIN_M: f64 = 0.5;
 /// Largest rotation error of a successful relocalization, degrees.
 const FOUND_WITHIN_DEG: f64 = 15.0;
-
-/// Frames of a recording to replay.
-#[derive(Debug, Clone)]
-pub struct Segment<'a> {
-    /// Latents of the whole recording under the tracker's adapter, row by frame, shape (n, k).
-    pub latents: ArrayView2<'a, f64>,
-    /// Raw features of the whole recording, shape (n, d), if observations should include them.
-    pub features: Option<ArrayView2<'a, f32>>,
-    /// Poses of the whole recording, `world_from_camera`, row by frame.
-    pub poses: &'a [Pose],
-    /// The frames to replay, in order.
-    pub frames: &'a [FrameId],
-}
-
-/// One frame of a stream to replay.
-#[derive(Debug, Clone)]
-pub struct Played {
-    /// Input of the tracker.
-    pub frame: Observation,
-    /// True pose, `world_from_camera`.
-    pub truth: Pose,
-}
 
 /// Initial pose of a replayed stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -57,92 +30,6 @@ pub struct Replay {
     pub updates: Vec<Update>,
     /// First row of each stream, in order; the first is 0.
     pub beginnings: Vec<usize>,
-}
-
-/// Replays segments one after the other, without a gap between them. Successive rows are
-/// `period_ns` nanoseconds apart.
-pub fn replay(
-    tracker: &Tracker,
-    segments: &[Segment<'_>],
-    period_ns: i64,
-    initial_pose: InitialPose,
-) -> Replay {
-    let mut frames = Vec::new();
-
-    let mut sequence: u64 = 0;
-    for segment in segments {
-        let mut previous: Option<FrameId> = None;
-        for &frame in segment.frames {
-            // Rows left out within a segment leave gaps in the numbers; there is none between
-            // segments.
-            sequence += previous.map_or(1, |before| u64::from(frame.0 - before.0));
-            previous = Some(frame);
-
-            let time_ns = sequence as i64 * period_ns;
-            frames.push(Played {
-                frame: Observation {
-                    feature: segment
-                        .features
-                        .map(|features| features.row(frame.row()).to_vec()),
-                    ..Observation::new(
-                        time_ns,
-                        sequence,
-                        segment.latents.row(frame.row()).to_owned(),
-                    )
-                },
-                truth: segment.poses[frame.row()],
-            });
-        }
-    }
-
-    replay_frames(tracker, &frames, initial_pose)
-}
-
-/// Replays a stream frame by frame.
-pub fn replay_frames(tracker: &Tracker, frames: &[Played], initial_pose: InitialPose) -> Replay {
-    let mut state = start(tracker, frames, initial_pose);
-    let mut found = Replay {
-        truth: Trajectory::default(),
-        sequences: Vec::new(),
-        updates: Vec::new(),
-        beginnings: vec![0],
-    };
-
-    for Played { frame, truth } in frames {
-        // Rejected frames (another adapter, or out of order) are skipped.
-        if let Ok(update) = tracker.observe(&mut state, frame) {
-            found.truth.times_ns.push(frame.time_ns);
-            found.truth.poses.push(*truth);
-            found.sequences.push(frame.sequence);
-            found.updates.push(update);
-        }
-    }
-
-    found
-}
-
-/// Replays frames of a room, one stream per sequence. The frame period of a stream is the mean of
-/// the recording, see [`period_ns`].
-pub fn replay_streams(
-    tracker: &Tracker,
-    segment: Segment<'_>,
-    room: &Room,
-    initial_pose: InitialPose,
-) -> Replay {
-    let same_sequence = |a: &FrameId, b: &FrameId| room.timeline().joins(*a, *b);
-    let streams = segment.frames.chunk_by(same_sequence).map(|frames| {
-        let stream = Segment {
-            frames,
-            ..segment.clone()
-        };
-        let period_ns = period_ns(room, frames);
-        (
-            replay(tracker, &[stream], period_ns, initial_pose),
-            period_ns,
-        )
-    });
-
-    joined(streams)
 }
 
 /// Joins several streams into one replay. Each comes with its mean frame period, nanoseconds.
@@ -193,19 +80,6 @@ pub fn period_ns(room: &Room, frames: &[FrameId]) -> i64 {
         period.round() as i64
     } else {
         assumed
-    }
-}
-
-fn start(tracker: &Tracker, frames: &[Played], initial_pose: InitialPose) -> State {
-    let first = frames.first().map(|played| played.truth);
-
-    match (initial_pose, first) {
-        (InitialPose::Given, Some(pose)) => tracker.start(Some(PoseWithCovariance::known(
-            pose,
-            INITIAL_DEVIATION,
-            INITIAL_DEVIATION,
-        ))),
-        _ => tracker.start(None),
     }
 }
 
@@ -263,11 +137,6 @@ impl Replay {
         self.truth.poses[beginning]
     }
 
-    /// Squared Mahalanobis lengths of the errors of all map poses.
-    pub fn map_pose_surprises(&self) -> Vec<f64> {
-        self.map_pose_surprises_where(|_| true)
-    }
-
     /// Squared Mahalanobis lengths of the errors of the map poses in rows selected by `keep`.
     pub fn map_pose_surprises_where(&self, keep: impl Fn(usize) -> bool) -> Vec<f64> {
         let mut surprises = Vec::new();
@@ -291,9 +160,7 @@ impl Replay {
                 continue;
             };
 
-            // A motion of exactly zero is no prediction: the first frame of a stream, or a
-            // discarded half turn. Motions over a jump count, with the covariance of an unobserved
-            // motion.
+            // A motion of exactly zero is that of the keyframe itself.
             let length = update.motion.norm();
             if length > 0.0 {
                 let true_motion = body_twist(&self.truth.poses[keyframe], truth);

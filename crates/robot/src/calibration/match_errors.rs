@@ -5,10 +5,9 @@ use ndarray::Array2;
 
 use super::Error;
 use super::embedded_room::EmbeddedRoom;
-use super::motions::share_to_believe;
 use super::robust_covariance;
-use seese3_core::adapter::{Adapter, ErrorTable, Stratum};
-use seese3_core::geometry::{Twist, body_twist, exp};
+use seese3_core::adapter::{ErrorTable, Stratum};
+use seese3_core::geometry::body_twist;
 use seese3_core::index::{ExactIndex, Exclusion, Index};
 use seese3_core::room::FrameId;
 use seese3_core::statistics::median;
@@ -25,41 +24,32 @@ const FEWEST_ERRORS: usize = 6;
 struct Match {
     /// In standard deviations of frame noise.
     distance: f64,
-    /// Motion predicted by the adapter.
-    read: Vector6<f64>,
-    /// True motion.
-    truth: Vector6<f64>,
+    motion: Vector6<f64>,
 }
 
 /// Error table of poses estimated from matches, binned by distance. `whitened` holds the whitened
 /// latents of each room, one row per frame.
-pub fn anchor_errors(
-    adapter: &Adapter,
+pub fn match_errors(
     rooms: &[EmbeddedRoom<'_>],
     whitened: &[Array2<f64>],
 ) -> Result<ErrorTable, Error> {
     let mut matches = Vec::new();
     for (room, whitened) in rooms.iter().zip(whitened) {
-        add_matches(adapter, room, whitened, &mut matches);
+        add_matches(room, whitened, &mut matches);
     }
     matches.sort_by(|a, b| a.distance.total_cmp(&b.distance));
-
-    // Units of one standard deviation of the trained motions make meters and radians comparable.
-    let scale = adapter.scale().deviation;
 
     let mut strata: Vec<Stratum> = Vec::new();
     for part in matches.chunks(matches.len().div_ceil(STRATA).max(1)) {
         let distances: Vec<f64> = part.iter().map(|found| found.distance).collect();
         let at = median(&distances);
-        let gain = share_to_believe(part.iter().map(|found| (&found.truth, &found.read)), &scale);
-        let residuals: Vec<Vector6<f64>> = part.iter().map(|found| found.residual(gain)).collect();
+        let residuals: Vec<Vector6<f64>> = part.iter().map(|found| found.motion).collect();
 
         // Repeated images have distance 0. Their bin is skipped: distances must increase strictly.
         let previous = strata.last().map_or(0.0, |last| last.at);
         if at > previous && residuals.len() > FEWEST_ERRORS {
             strata.push(Stratum {
                 at,
-                gain,
                 covariance: robust_covariance(&residuals)?,
             });
         }
@@ -69,12 +59,7 @@ pub fn anchor_errors(
 }
 
 /// Matches every frame of a room with the rest of the room, once per exclusion radius.
-fn add_matches(
-    adapter: &Adapter,
-    room: &EmbeddedRoom<'_>,
-    whitened: &Array2<f64>,
-    matches: &mut Vec<Match>,
-) {
+fn add_matches(room: &EmbeddedRoom<'_>, whitened: &Array2<f64>, matches: &mut Vec<Match>) {
     let frames: Vec<FrameId> = (0..whitened.nrows() as u32).map(FrameId).collect();
     let index = ExactIndex::new(whitened.view(), &frames);
 
@@ -90,20 +75,8 @@ fn add_matches(
             let at = best.frame.row();
             matches.push(Match {
                 distance: best.distance,
-                read: adapter
-                    .motion_without_mean(room.latents.row(at), room.latents.row(row))
-                    .to_vector(),
-                truth: body_twist(&room.poses[at], &room.poses[row]).to_vector(),
+                motion: body_twist(&room.poses[at], &room.poses[row]).to_vector(),
             });
         }
-    }
-}
-
-impl Match {
-    /// Error of the pose estimated with this gain, in its body frame.
-    fn residual(&self, gain: f64) -> Vector6<f64> {
-        let found = exp(&Twist::from_vector(&(self.read * gain)));
-        let truth = exp(&Twist::from_vector(&self.truth));
-        body_twist(&found, &truth).to_vector()
     }
 }
