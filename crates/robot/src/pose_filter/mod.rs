@@ -340,6 +340,7 @@ impl PoseFilter {
             }
             _ => None,
         };
+
         state.mark_measured(frame);
         let keyframe = state.keyframe_with(frame, &motion, &self.parameters);
         let replaced = state.belief.filter(|_| correction == Correction::Replaced);
@@ -383,6 +384,7 @@ impl PoseFilter {
         let is_new = |located: &&LocatedPose| {
             self.parameters.fuse && (state.unchanged_frames == 0 || located.camera.is_some())
         };
+
         let new: Vec<&LocatedPose> = frame.located.iter().filter(is_new).collect();
         let count = new.len() as f64;
         let judged = |located: &'a LocatedPose| {

@@ -22,11 +22,20 @@ fn parameters(correlation_range: f64) -> FilterParameters {
 }
 
 fn filter() -> PoseFilter {
+    filter_with(true)
+}
+
+/// A filter in one room; `fuse` says whether located views correct the pose.
+fn filter_with(fuse: bool) -> PoseFilter {
     let room = FilterRoom {
         motion_prior: MotionPrior::assumed(),
         extent_m: 3.0,
     };
-    PoseFilter::new(vec![room], FilterParameters::default()).unwrap()
+    let parameters = FilterParameters {
+        fuse,
+        ..FilterParameters::default()
+    };
+    PoseFilter::new(vec![room], parameters).unwrap()
 }
 
 fn located(pose: Pose, deviation: f64) -> PoseWithCovariance {
@@ -330,15 +339,7 @@ fn a_carried_pose_is_tracking_while_it_is_certain() {
 /// Without fusion, visual odometry carries it.
 #[test]
 fn visual_odometry_carries_a_set_pose_without_fusion() {
-    let room = FilterRoom {
-        motion_prior: MotionPrior::assumed(),
-        extent_m: 3.0,
-    };
-    let parameters = FilterParameters {
-        fuse: false,
-        ..FilterParameters::default()
-    };
-    let filter = PoseFilter::new(vec![room], parameters).unwrap();
+    let filter = filter_with(false);
     let mut state = filter.start(Some(&located(path(1), 1e-3)));
     for number in 1..=30 {
         let observed = ViewObservation {
@@ -807,15 +808,7 @@ fn views_of_one_frame_count_as_one() {
 /// Oracle: the contract of a stream that is not corrected: gravity does not turn its pose.
 #[test]
 fn gravity_does_not_correct_a_stream_without_fusion() {
-    let room = FilterRoom {
-        motion_prior: MotionPrior::assumed(),
-        extent_m: 3.0,
-    };
-    let parameters = FilterParameters {
-        fuse: false,
-        ..FilterParameters::default()
-    };
-    let filter = PoseFilter::new(vec![room], parameters).unwrap();
+    let filter = filter_with(false);
     let (mut state, level) = level_stream(&filter, [0.1, 0.2]);
     let rolled = level * Pose::rotation(Vector3::z() * 0.1);
     let update = filter

@@ -420,6 +420,7 @@ impl Session {
             None => self.detected(frame).map(|observed| (observed, None)),
         }
         .map_err(refused(Reason::View))?;
+
         let observation = ViewObservation {
             measured,
             gravity,
@@ -470,6 +471,7 @@ impl Session {
                 is_blank: view.is_blank,
             })
             .collect();
+
         let room = self.room_to_match();
         let retrieval = self.engine.retrieval.as_mut().ok_or(Error::Internal)?;
         let found = retrieval.front_end.read(&views, &retrieval.maps, room);
