@@ -107,6 +107,7 @@ impl Demo {
             created: String::new(),
             features: Vec::new(),
             keypoints: None,
+            tracking: None,
         };
         let rooms = [(stored, features)];
 

@@ -55,6 +55,20 @@ train
   seese3 train --store suite --room 'studio7-000*' --preset steady --split whole --calibrate-on 'studio7-001*' --name robot
 fit
   seese3 fit --store store --room kitchen --adapter robot
+fit-tracking
+  seese3 fit-tracking --store store --room 'hall-*' --check office --adapter robot --json fitted.json
+  seese3 fit-tracking --store store --room hall --publish
+map
+  seese3 map crop --store store --room hall --box -2,-1,0,6,4,3 --name hall-west
+  seese3 map merge --store store --room hall --add office --align --name floor
+map crop
+  seese3 map crop --store store --room hall --rows 0..200 --name hall-begin
+map transform
+  seese3 map transform --store store --room hall --matrix site_from_hall.txt --name hall-site
+map align
+  seese3 map align --store store --room office --to hall --with-scale --name office-in-hall
+map merge
+  seese3 map merge --store store --room hall --add office --align --name floor
 evaluate
   seese3 evaluate --store store --room kitchen --exclude-source
   seese3 evaluate --store store --room kitchen --plot hit.svg --table hit.tex --json hit.json

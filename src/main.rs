@@ -24,6 +24,7 @@ mod config;
 mod encode;
 mod fit;
 mod health;
+mod map;
 mod pose_report;
 #[cfg(feature = "lab")]
 mod probe;
@@ -43,6 +44,8 @@ mod check;
 mod demo;
 #[cfg(feature = "lab")]
 mod evaluate;
+#[cfg(feature = "lab")]
+mod fit_tracking;
 mod import;
 #[cfg(feature = "lab")]
 mod studio;
@@ -141,6 +144,11 @@ enum Command {
     Train(train::Train),
     /// Fit an adapter to one room, measure its errors by cross-validation, and publish it
     Fit(fit::Fit),
+    /// Crop, move, align and merge mapped rooms
+    Map(map::Map),
+    #[cfg(feature = "lab")]
+    /// Fit the parameters of filters that track cameras in rooms
+    FitTracking(fit_tracking::FitTracking),
     #[cfg(feature = "lab")]
     /// Score navigators on held-out motions: Hit@ε with baselines and intervals
     Evaluate(evaluate::Evaluate),
@@ -217,6 +225,9 @@ async fn dispatch(cli: Cli) -> anyhow::Result<()> {
         Command::Export(arguments) => arguments.run().await,
         Command::Encode(arguments) => arguments.run().await,
         Command::Fit(arguments) => arguments.run().await,
+        Command::Map(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
+        Command::FitTracking(arguments) => arguments.run().await,
         Command::Encoders(arguments) => arguments.run(),
         #[cfg(feature = "lab")]
         Command::Studio(arguments) => arguments.run().await,

@@ -6,10 +6,14 @@ mod localization;
 mod motion;
 mod odometry;
 mod planning;
+mod recordings;
 mod robustness;
 mod room_images;
 mod peer;
 mod trajectory;
+
+pub use keypoint_views::KeypointViews;
+pub use recordings::Recordings;
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};

@@ -6,12 +6,10 @@ use std::sync::{Mutex, PoisonError};
 
 use anyhow::Context;
 use clap::Args;
-use rayon::prelude::*;
-
 use seese3_core::splits::HoldOut;
 use seese3_lab::experiments::odometry::{Relocalisation, RoomOdometry, evaluate, relocalisation};
 use seese3_lab::experiments::replay::Replay;
-use seese3_lab::experiments::tracked_room::{KeypointRecording, TrackedRoom, TrackingProtocol};
+use seese3_lab::experiments::tracked_room::TrackingProtocol;
 use seese3_lab::report::{
     APE_FORMULA, coverage_table, odometry_json, odometry_table, other_rooms_text,
     relocalisation_text, scenarios_text,
@@ -21,9 +19,8 @@ use seese3_robot::pose_filter::FilterParameters;
 use super::super::named::one_of;
 use super::super::output::{JsonOutput, say, write_file};
 use super::super::progress::bar;
-use super::super::rooms::{data, load_rooms, room_names};
 use super::keypoint_views::KeypointViews;
-use super::say_leaks;
+use super::recordings::Recordings;
 use seese3_data::export::{kitti_trajectory, tum_trajectory};
 use seese3_store::Store;
 
@@ -56,6 +53,10 @@ pub struct Odometry {
     /// ROOM.odom
     #[arg(long)]
     paths: Option<PathBuf>,
+    /// Parameters of the filter: a file of `fit-tracking --json`. By default those that were published with
+    /// a room, if any
+    #[arg(long, value_name = "FILE")]
+    parameters: Option<PathBuf>,
     /// Print a line for every room, not only the mean
     #[arg(long)]
     each: bool,
@@ -69,80 +70,35 @@ impl Odometry {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
         let store = Store::open(&self.store)?;
-        match &self.adapter {
-            Some(adapter) => {
-                self.views.refuse_images()?;
-                self.by_adapter(&store, adapter).await
-            }
-            None => self.by_keypoints(&store).await,
-        }
-    }
-
-    async fn by_adapter(&self, store: &Store, adapter: &str) -> anyhow::Result<()> {
-        let stored = store.load_adapter(adapter, None).await?;
-        let source = stored.adapter.source().name.clone();
-        let rooms = load_rooms(store, &self.rooms, Some(&source)).await?;
-        say_leaks(&rooms, &stored.record);
-
-        let adapter = stored.adapter;
-        let rooms: Vec<TrackedRoom<'_>> = rooms
-            .iter()
-            .map(|room| TrackedRoom::by_adapter(&data(room), &adapter, &self.protocol()))
-            .collect::<Result<_, _>>()?;
-        let tracked = self.tracked(rooms.len(), |done| evaluate(&rooms, done))?;
-
-        // Relocalization needs at least two rooms to choose from.
-        let relocalised = (rooms.len() > 1)
-            .then(|| relocalisation(&rooms))
+        let given = self
+            .parameters
+            .as_deref()
+            .map(read_parameters)
             .transpose()?;
+        let adapter = self.adapter.as_deref();
+        let recordings = Recordings::load(&store, &self.rooms, adapter, &self.views).await?;
 
-        let what = format!("adapter '{}' revision {}", stored.name, stored.revision);
+        let pool = self.views.runtime.pool()?;
+        let (tracked, relocalised) = pool.install(|| -> anyhow::Result<_> {
+            let rooms = recordings.tracked(&|of_room| self.protocol(given.or(of_room)))?;
+            let tracked = self.tracked(rooms.len(), |done| evaluate(&rooms, done))?;
+            // Relocalization of features needs at least two rooms to choose from.
+            let relocalised = (adapter.is_some() && rooms.len() > 1)
+                .then(|| relocalisation(&rooms))
+                .transpose()?;
+            Ok((tracked, relocalised))
+        })?;
+
         let how = if self.no_fusion {
             "dead reckoning"
         } else if self.fit {
             "fused with estimates of an adapter fitted to the mapped frames"
-        } else {
+        } else if adapter.is_some() {
             "fused with the most similar mapped frames"
-        };
-        self.report(&tracked, &what, how, relocalised.as_ref())
-    }
-
-    /// Tracks by matched keypoints alone.
-    async fn by_keypoints(&self, store: &Store) -> anyhow::Result<()> {
-        let mut rooms = Vec::new();
-        for name in room_names(store, &self.rooms).await? {
-            let stored = store.load_room(&name, None).await?;
-            let (keypoints, encoded) = self.views.encode_matchable(&stored)?;
-            rooms.push((stored.room.clone(), keypoints.map.camera, encoded));
-        }
-
-        let recordings: Vec<KeypointRecording<'_>> = rooms
-            .iter()
-            .map(|(room, camera, encoded)| KeypointRecording {
-                room,
-                features: encoded.rows.view(),
-                keypoints: &encoded.keypoints,
-                camera: *camera,
-            })
-            .collect();
-
-        let pool = self.views.runtime.pool()?;
-        let tracked = self.tracked(rooms.len(), |done| {
-            pool.install(|| {
-                let protocol = self.protocol();
-                let rooms: Vec<TrackedRoom<'_>> = recordings
-                    .par_iter()
-                    .map(|recording| TrackedRoom::by_keypoints(recording, &protocol))
-                    .collect::<Result<_, _>>()?;
-                evaluate(&rooms, done)
-            })
-        })?;
-        let how = if self.no_fusion {
-            "dead reckoning"
         } else {
             "fused with located views"
         };
-        self.report(&tracked, "matched keypoints, no adapter", how, None)
+        self.report(&tracked, &recordings.words(), how, relocalised.as_ref())
     }
 
     /// Evaluates with a progress bar. Paths are written as each room completes; the first failure
@@ -211,8 +167,8 @@ impl Odometry {
         self.json.write(&odometry_json(tracked, relocalised))
     }
 
-    fn protocol(&self) -> TrackingProtocol {
-        let default = FilterParameters::default();
+    fn protocol(&self, parameters: Option<FilterParameters>) -> TrackingProtocol {
+        let default = parameters.unwrap_or_default();
         TrackingProtocol {
             hold_out: self.hold_out,
             parameters: FilterParameters {
@@ -230,6 +186,21 @@ impl Odometry {
             None => Ok(()),
         }
     }
+}
+
+/// The parameters in a file of `fit-tracking --json`.
+fn read_parameters(file: &Path) -> anyhow::Result<FilterParameters> {
+    #[derive(serde::Deserialize)]
+    struct Fitted {
+        parameters: FilterParameters,
+    }
+    let shown = file.display();
+    let bytes = std::fs::read(file).with_context(|| format!("{shown} cannot be read"))?;
+    let fitted: Fitted = serde_json::from_slice(&bytes)
+        .with_context(|| format!("{shown} is no file of `seese3 fit-tracking --json`"))?;
+    let checked = fitted.parameters.check();
+    checked.with_context(|| format!("{shown}: parameters"))?;
+    Ok(fitted.parameters)
 }
 
 fn write_paths(folder: &Path, room: &str, replay: &Replay) -> anyhow::Result<()> {

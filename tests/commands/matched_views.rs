@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use seese3_core::geometry::{Pose, PoseError};
-use seese3_testing::{number, shared};
+use seese3_testing::{near, number, shared};
 use serde_json::Value;
 
 use crate::program::Place;
@@ -149,6 +149,7 @@ fn a_view_is_located_by_its_keypoints_without_an_adapter() {
 
     tracks_without_an_adapter(&here, &to);
     evaluates_odometry_without_an_adapter(&here);
+    moves_a_map_and_back(&here);
 
     let strange = format!("localize {to} --room kitchen --camera mapping --image {other}");
     here.prints(
@@ -247,6 +248,48 @@ fn evaluates_odometry_without_an_adapter(here: &Place) {
     here.refuses(
         "evaluate odometry --store plain --room studio3-0000 --hold-out interleaved",
         &["has no keypoints", "--adapter"],
+    );
+}
+
+/// Oracle: the stated transform, which the alignment by keypoints has to undo.
+fn moves_a_map_and_back(here: &Place) {
+    fs::write(
+        here.file("moved.txt"),
+        "0 -1.5 0 1\n1.5 0 0 -2\n0 0 1.5 0.5\n0 0 0 1\n",
+    )
+    .unwrap();
+    let map = "--store store --room";
+    here.succeeds(&format!(
+        "map transform {map} kitchen --matrix moved.txt --name moved"
+    ));
+    here.prints(
+        &format!("map align {map} moved --to kitchen --with-scale --name back --json back.json"),
+        &["aligned by", "scale 0.66"],
+    );
+    let found = here.json("back.json");
+    let entry =
+        |row: usize, column: usize| number(&found["alignment"]["new_from_old"][row][column]);
+    // The inverse: x = (y' + 2) / 1.5, y = (1 - x') / 1.5, z = (z' - 0.5) / 1.5.
+    for (row, expected) in [
+        [0.0, 1.0 / 1.5, 0.0, 2.0 / 1.5],
+        [-1.0 / 1.5, 0.0, 0.0, 1.0 / 1.5],
+        [0.0, 0.0, 1.0 / 1.5, -0.5 / 1.5],
+    ]
+    .iter()
+    .enumerate()
+    {
+        for (column, expected) in expected.iter().enumerate() {
+            near("new_from_old", entry(row, column), *expected, 0.02);
+        }
+    }
+
+    here.refuses(
+        &format!("map crop {map} kitchen --rows 0..3 --name back"),
+        &["--name: room 'back' exists"],
+    );
+    here.refuses(
+        &format!("map crop {map} kitchen --box 90,90,90,91,91,91 --name nothing"),
+        &["no frame of room 'kitchen' is left"],
     );
 }
 

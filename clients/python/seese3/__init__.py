@@ -59,7 +59,18 @@ from .errors import (
 )
 from .newest import AsyncNewest, Newest
 from .program import Server, run, serve
-from .requests import Gravity, InitialPose, Odometry, Prediction, Question, RigCamera, TrackConfig, Upload
+from .requests import (
+    Gravity,
+    InertialSamples,
+    InertialSensor,
+    InitialPose,
+    Odometry,
+    Prediction,
+    Question,
+    RigCamera,
+    TrackConfig,
+    Upload,
+)
 from .store import Store, StoredAdapter, StoredKeypoints, StoredRoom
 from .views import Feature, Latent, View
 
@@ -87,6 +98,8 @@ __all__ = [
     "ForbiddenError",
     "Frame",
     "Gravity",
+    "InertialSamples",
+    "InertialSensor",
     "InitialPose",
     "InvalidFieldError",
     "Latent",

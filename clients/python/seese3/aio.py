@@ -15,7 +15,7 @@ import numpy.typing as npt
 from . import answers, channel, errors, requests
 from .answers import Adapter, Camera, Default, Evaluation, Publication, Room, TrackRefusal, TrackStart, TrackUpdate
 from .geometry import wire_pose
-from .requests import Gravity, InitialPose, Odometry, Prediction, Question, TrackConfig, Upload
+from .requests import Gravity, InertialSamples, InitialPose, Odometry, Prediction, Question, TrackConfig, Upload
 from .v1 import (
     catalog_pb2,
     catalog_pb2_grpc,
@@ -697,12 +697,17 @@ class AsyncTrack:
         odometry: Odometry | None = None,
         gravity: Gravity | None = None,
         other_views: dict[str, View] | None = None,
+        inertial: InertialSamples | None = None,
+        exposure_ns: int = 0,
     ) -> TrackUpdate | TrackRefusal:
         """Sends a frame, taken at a time on the camera's clock, and returns what the server says of it.
 
+        `inertial` are the samples since the last frame. `exposure_ns` is the duration of the exposure, which begins at
+        the time.
+
         A step that raises, or that is given up, did not happen: the frame may be sent again.
         """
-        frame = self._frame(view, timestamp_ns, sequence, odometry, gravity, other_views)
+        frame = self._frame(view, timestamp_ns, sequence, odometry, gravity, other_views, inertial, exposure_ns)
         return _answered(await self._exchange(frame))
 
     async def follow(
@@ -784,9 +789,13 @@ class AsyncTrack:
         odometry: Odometry | None = None,
         gravity: Gravity | None = None,
         other_views: dict[str, View] | None = None,
+        inertial: InertialSamples | None = None,
+        exposure_ns: int = 0,
     ) -> odometry_pb2.TrackRequest:
         number = self.last_sequence + 1 if sequence is None else sequence
-        frame = requests.track_frame(view, timestamp_ns, number, odometry, gravity, other_views or {})
+        frame = requests.track_frame(
+            view, timestamp_ns, number, odometry, gravity, other_views or {}, inertial, exposure_ns
+        )
         self.last_sequence = number
         return frame
 

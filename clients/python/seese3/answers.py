@@ -690,6 +690,7 @@ class TrackStart:
     - `keyframe_displacement`, `keyframe_frames`: a new keyframe is taken after a motion of this norm, metres and
       radians mixed, and after the time of so many frames.
     - `calibration_rooms`: in how many rooms the covariances were calibrated.
+    - `has_visual_odometry`: whether the motion between images is measured; not of features and latents.
     """
 
     adapter: Revision | None
@@ -697,6 +698,7 @@ class TrackStart:
     keyframe_displacement: float | None
     keyframe_frames: int | None
     calibration_rooms: int
+    has_visual_odometry: bool
 
     @classmethod
     def of(cls, message: odometry_pb2.TrackStarted) -> TrackStart:
@@ -706,6 +708,7 @@ class TrackStart:
             _known(message.keyframes, "displacement"),
             _known(message.keyframes, "frames"),
             message.calibration_rooms,
+            message.has_visual_odometry,
         )
 
 
@@ -723,7 +726,9 @@ class Candidate:
 @dataclass(frozen=True, eq=False)
 class TrackUpdate:
     """Where a tracked camera is. `status` is "tracking", "degraded", "lost" or "relocalizing"; only while it is
-    "tracking" should a robot rely on `map_from_camera`. Velocities are (6,) in m/s and rad/s, in the body frame."""
+    "tracking" should a robot rely on `map_from_camera`. Velocities are (6,) in m/s and rad/s, in the body frame.
+    `contradicted` are the sensors that contradict the others or the pose: "odometry", "images", "inertial", "gravity"
+    or "views"."""
 
     timestamp_ns: int
     sequence: int
@@ -750,6 +755,7 @@ class TrackUpdate:
     match_used: bool
     match_surprise: float | None
     candidate: Candidate | None
+    contradicted: tuple[str, ...]
     elapsed_ns: int
 
     @classmethod
@@ -786,6 +792,9 @@ class TrackUpdate:
             match_used=message.match_used,
             match_surprise=_known(message, "match_surprise"),
             candidate=_candidate(message.candidate) if message.HasField("candidate") else None,
+            contradicted=tuple(
+                _word(odometry_pb2.TrackSensor, sensor, "TRACK_SENSOR_") for sensor in message.contradicted
+            ),
             elapsed_ns=message.elapsed_ns,
         )
 
@@ -803,7 +812,7 @@ def _candidate(message: odometry_pb2.PlaceCandidate) -> Candidate:
 @dataclass(frozen=True)
 class TrackRefusal:
     """A frame that a tracking stream could not use; the stream goes on. `reason` is "late", "duplicate",
-    "superseded", "view", "pose", "odometry" or "gravity"."""
+    "superseded", "view", "pose", "odometry", "gravity" or "inertial"."""
 
     timestamp_ns: int
     sequence: int

@@ -168,6 +168,57 @@ class RigCamera:
 
 
 @dataclass(frozen=True, eq=False)
+class InertialSensor:
+    """A gyroscope and an accelerometer, by their pose (4, 4) on the base or, where that is not known, from the camera.
+
+    - `gyroscope_noise`, `accelerometer_noise`: white noise, rad/s/√Hz and m/s²/√Hz.
+    - `gyroscope_bias`, `accelerometer_bias`: standard deviations of the biases at the beginning, rad/s and m/s².
+    - `gyroscope_bias_walk`, `accelerometer_bias_walk`: random walks of the biases, rad/s²/√Hz and m/s³/√Hz.
+    - `time_offset_ns`: is added to the times of the samples to get those of the images.
+    """
+
+    pose: npt.ArrayLike | None = None
+    gyroscope_noise: float | None = None
+    accelerometer_noise: float | None = None
+    gyroscope_bias: float | None = None
+    accelerometer_bias: float | None = None
+    gyroscope_bias_walk: float | None = None
+    accelerometer_bias_walk: float | None = None
+    time_offset_ns: int = 0
+
+    def message(self) -> odometry_pb2.InertialSensor:
+        noises = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "pose"}
+        return odometry_pb2.InertialSensor(pose=None if self.pose is None else wire_pose(self.pose), **noises)
+
+
+@dataclass(frozen=True, eq=False)
+class InertialSamples:
+    """Samples of an inertial sensor in its axes: times (n,) in ns, angular velocities (n, 3) in rad/s, and
+    accelerations (n, 3) in m/s², which are 9.8 upwards at rest."""
+
+    timestamps_ns: Sequence[int] | npt.NDArray[np.int64]
+    angular_velocity: npt.ArrayLike
+    linear_acceleration: npt.ArrayLike
+
+    def messages(self) -> list[odometry_pb2.InertialSample]:
+        integers(self.timestamps_ns, "inertial.timestamps_ns", range(-(1 << 63), 1 << 63))
+        count = len(self.timestamps_ns)
+        columns = []
+        for argument in ("angular_velocity", "linear_acceleration"):
+            values = real(getattr(self, argument), f"inertial.{argument}")
+            if values.shape != (count, 3):
+                raise ValueError(f"inertial.{argument}: is {values.shape}, not ({count}, 3)")
+            columns.append(values)
+        rows = zip(self.timestamps_ns, *columns, strict=True)
+        return [
+            odometry_pb2.InertialSample(
+                timestamp_ns=int(time), angular_velocity=wire_vector(rate), linear_acceleration=wire_vector(force)
+            )
+            for time, rate, force in rows
+        ]
+
+
+@dataclass(frozen=True, eq=False)
 class TrackConfig:
     """What a tracking stream is to do. What is left out is chosen by the server."""
 
@@ -189,6 +240,11 @@ class TrackConfig:
     unknown camera is estimated from the first images."""
     gravity_in_map: npt.ArrayLike | None = None
     other_cameras: Sequence[RigCamera] = ()
+    inertial_sensor: InertialSensor | None = None
+    trust_odometry: bool = False
+    """Whether the odometry of the steps is used where images or the gyroscope contradict it, and carries the pose."""
+    time_offset_ns: int = 0
+    """Time from a frame's timestamp to the start of its exposure, besides that of the inertial sensor."""
 
     def message(self) -> odometry_pb2.TrackConfig:
         if self.token_every < 1:
@@ -218,17 +274,25 @@ class TrackConfig:
             mapping_camera=camera is not None and camera.mapping_camera,
             gravity_in_map=None if self.gravity_in_map is None else wire_vector(self.gravity_in_map),
             other_cameras=others,
+            inertial_sensor=self.inertial_sensor.message() if self.inertial_sensor else None,
+            trust_odometry=self.trust_odometry,
+            time_offset_ns=self.time_offset_ns,
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Odometry:
-    """The pose (4, 4) of the wheels' or another odometry at a frame, and how far it drifts, as shares of the motion."""
+    """The pose (4, 4) of the wheels' or another odometry at a frame, and how far it drifts, as shares of the motion.
+
+    `velocity_covariance` (6, 6), on (v, ω) in the body frame, is that of the independent error of the velocity since
+    the last frame, like `twist.covariance` of ROS.
+    """
 
     pose: npt.ArrayLike
     child_frame: str = ""
     translation_share: float | None = None
     rotation_share: float | None = None
+    velocity_covariance: npt.ArrayLike | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,14 +311,21 @@ def track_frame(
     odometry: Odometry | None,
     gravity: Gravity | None,
     other_views: dict[str, View],
+    inertial: InertialSamples | None,
+    exposure_ns: int,
 ) -> odometry_pb2.TrackRequest:
     """A frame of a tracking stream."""
     measured = None
     if odometry is not None:
+        noise = odometry.velocity_covariance
+        covariance = None if noise is None else real(noise, "odometry.velocity_covariance")
+        if covariance is not None and covariance.shape != (6, 6):
+            raise ValueError(f"odometry.velocity_covariance: is {covariance.shape}, not (6, 6)")
         measured = odometry_pb2.MeasuredOdometry(
             pose=wire_pose(odometry.pose, child_frame=odometry.child_frame),
             translation_share=odometry.translation_share,
             rotation_share=odometry.rotation_share,
+            velocity_covariance=None if covariance is None else covariance.ravel().tolist(),
         )
     down = None
     if gravity is not None:
@@ -270,6 +341,8 @@ def track_frame(
             odometry=measured,
             gravity=down,
             other_views=others,
+            inertial_samples=inertial.messages() if inertial else None,
+            exposure_ns=exposure_ns,
         )
     )
 

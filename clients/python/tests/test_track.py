@@ -181,3 +181,35 @@ def test_what_a_stream_refuses(client: seese3.Client) -> None:
         track.reset()
         with pytest.raises(seese3.InvalidFieldError):
             track.set_initial_pose(seese3.InitialPose(np.eye(4), translation_deviation_m=-1.0))
+
+
+def test_a_camera_is_followed_with_an_inertial_sensor(client: seese3.Client, drawn: Path) -> None:
+    room = seese3.Store(drawn).room(ROOM)
+    sensor = seese3.InertialSensor(np.eye(4), gyroscope_noise=1e-3, time_offset_ns=1_000_000)
+    config = seese3.TrackConfig(
+        room=ROOM, initial_pose=seese3.InitialPose(room.poses[0]), inertial_sensor=sensor, trust_odometry=True
+    )
+    # A sensor that says the opposite of the views: it turns by 2 rad/s, and they by far less.
+    rate, up = np.tile([0.0, 2.0, 0.0], (5, 1)), np.tile([0.0, 0.0, 9.8], (5, 1))
+    noise = np.diag([1e-4] * 6)
+    with client.track(config) as track:
+        assert track.start is not None and not track.start.has_visual_odometry
+        for row in range(20):
+            begins = max(row - 1, 0) * PERIOD_NS - 1_000_000
+            samples = seese3.InertialSamples(begins + np.arange(5) * (PERIOD_NS // 5), rate, up)
+            wheels = seese3.Odometry(room.poses[row], velocity_covariance=noise)
+            moved = None if row == 0 else samples
+            update = track.step(
+                room.features[FEATURES][row], row * PERIOD_NS, odometry=wheels, inertial=moved, exposure_ns=2_000_000
+            )
+            assert isinstance(update, seese3.TrackUpdate), update
+        assert update.contradicted == ("inertial",)
+
+        # Samples that are known already are left out; samples out of order are refused.
+        again = track.step(room.features[FEATURES][20], 20 * PERIOD_NS, inertial=samples)
+        assert isinstance(again, seese3.TrackUpdate)
+        reverse = seese3.InertialSamples(21 * PERIOD_NS - np.arange(5), rate, up)
+        refused = track.step(room.features[FEATURES][21], 21 * PERIOD_NS, inertial=reverse)
+        assert isinstance(refused, seese3.TrackRefusal) and refused.reason == "inertial"
+    with pytest.raises(ValueError, match=r"angular_velocity.*\(5, 3\)"):
+        seese3.InertialSamples(np.arange(5), rate[:4], up).messages()

@@ -25,6 +25,11 @@ def status_name(update):
     return odometry_pb2.TrackStatus.Name(update.status).removeprefix("TRACK_STATUS_")
 
 
+def sensor_names(update):
+    """The sensors that contradict the others or the pose."""
+    return [odometry_pb2.TrackSensor.Name(sensor).removeprefix("TRACK_SENSOR_") for sensor in update.contradicted]
+
+
 def body_of(update):
     """The names of the fields of the base, where it is known, else of the camera: in odom, in map, its covariance, its velocity."""
     if update.HasField("odom_from_base"):

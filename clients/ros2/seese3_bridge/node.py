@@ -1,5 +1,6 @@
 """The node: subscriptions, publishers, and the thread that follows the server's answers."""
 
+import collections
 import functools
 import sys
 import threading
@@ -19,7 +20,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from tf2_ros import TransformBroadcaster
 
 from . import answers, requests
-from .stream import Stream
+from .stream import SAMPLES, Stream
 
 LEVELS = {"TRACKING": 0, "DEGRADED": 1, "RELOCALIZING": 1, "LOST": 2}
 # What another sensor said so long ago says nothing of a frame, nanoseconds.
@@ -28,7 +29,8 @@ OLD_NS = 50_000_000
 TOGETHER_NS = 20_000_000
 KEEPALIVE = [("grpc.keepalive_time_ms", 20_000), ("grpc.keepalive_timeout_ms", 10_000)]
 PARAMETERS = {"server": "127.0.0.1:50051", "room": "", "adapter": "", "camera_frame": "camera_optical_frame",
-              "base_frame": "base_link", "publish_tf": False, "use_camera_info": False, "wheel_drift": 0.05}
+              "base_frame": "base_link", "publish_tf": False, "use_camera_info": False, "wheel_drift": 0.05,
+              "use_wheel_covariance": False, "trust_odometry": False, "inertial": False}
 
 
 class Bridge(Node):
@@ -41,6 +43,8 @@ class Bridge(Node):
         # The last of each sensor, with its stamp.
         self.wheels = self.gravity = None
         self.beside, self.gravity_of = {}, requests.Gravity()
+        # Samples of the inertial sensor since the last frame.
+        self.samples, self.last_sample_ns = collections.deque(maxlen=SAMPLES), 0
         # A frame that waits for the images of the other cameras.
         self.waiting, self.has_failed = None, False
         self.begins = threading.Event()
@@ -68,7 +72,11 @@ class Bridge(Node):
             room=given["room"], adapter=given["adapter"], back_pressure=odometry_pb2.BACK_PRESSURE_NEWEST,
             frames=odometry_pb2.FrameNames(camera=given["camera_frame"], base=given["base_frame"]),
             base_from_camera=requests.mounting("base_from_camera", self.numbers("base_from_camera")),
-            gravity_in_map=requests.direction("gravity_in_map", self.numbers("gravity_in_map")))
+            gravity_in_map=requests.direction("gravity_in_map", self.numbers("gravity_in_map")),
+            trust_odometry=given["trust_odometry"])
+        if given["inertial"]:
+            pose = requests.mounting("base_from_imu", self.numbers("base_from_imu"))
+            config.inertial_sensor.CopyFrom(odometry_pb2.InertialSensor(pose=pose))
 
         for name in self.declare_parameter("other_cameras", Parameter.Type.STRING_ARRAY).value or []:
             parameter = f"{name}.base_from_camera"
@@ -93,7 +101,7 @@ class Bridge(Node):
             self.create_subscription(CameraInfo, "~/camera_info", self.on_camera_info, sensor)
         if has_base:
             self.create_subscription(Odometry, "~/wheels", self.on_wheels, sensor)
-        if self.config.HasField("gravity_in_map"):
+        if self.config.HasField("gravity_in_map") or self.given["inertial"]:
             self.create_subscription(Imu, "~/imu", self.on_imu, sensor)
 
     # What sensors say.
@@ -120,7 +128,11 @@ class Bridge(Node):
         if self.wheels is not None and abs(self.wheels[0] - stamp) <= OLD_NS:
             frame.odometry.CopyFrom(self.wheels[1])
             self.wheels = None
-        if self.gravity is not None and abs(self.gravity[0] - stamp) <= OLD_NS:
+        while self.samples and self.samples[0].timestamp_ns <= stamp:
+            frame.inertial_samples.append(self.samples.popleft())
+        # The accelerometer of an inertial sensor also shows which way is down.
+        has_gravity = self.config.HasField("gravity_in_map") and not self.given["inertial"]
+        if has_gravity and self.gravity is not None and abs(self.gravity[0] - stamp) <= OLD_NS:
             frame.gravity.CopyFrom(self.gravity[1])
         self.waiting = frame
         if len(self.views_beside(stamp)) == len(self.config.other_cameras):
@@ -165,10 +177,16 @@ class Bridge(Node):
         self.begins.set()
 
     def on_wheels(self, message):
-        measured = requests.measured_odometry(message, self.given["base_frame"], self.given["wheel_drift"])
+        measured = requests.measured_odometry(message, self.given["base_frame"], self.given["wheel_drift"],
+                                              self.given["use_wheel_covariance"])
         self.wheels = requests.nanoseconds(message.header.stamp), measured
 
     def on_imu(self, imu):
+        if self.given["inertial"]:
+            sample = requests.inertial_sample(imu)
+            if sample is not None and sample.timestamp_ns > self.last_sample_ns:
+                self.samples.append(sample)
+                self.last_sample_ns = sample.timestamp_ns
         if (measured := self.gravity_of.after(imu)) is not None:
             self.gravity = requests.nanoseconds(imu.header.stamp), measured
 
@@ -197,7 +215,9 @@ class Bridge(Node):
         if self.tf is not None:
             self.tf.sendTransform(answers.transforms(update, TransformStamped))
         name = answers.status_name(update)
-        self.report(LEVELS.get(name, 2), f"{name}: {update.reason}", update.timestamp_ns)
+        against = ", ".join(answers.sensor_names(update))
+        text = f"{name}: {update.reason}" + (f" (contradicted: {against})" if against else "")
+        self.report(LEVELS.get(name, 2), text, update.timestamp_ns)
         self.counts["updates"] += 1
 
     def refused(self, refusal):

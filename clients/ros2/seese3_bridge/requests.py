@@ -9,6 +9,8 @@ from seese3.v1 import geometry_pb2, odometry_pb2
 # Encodings of sensor_msgs/Image, as Pillow names the modes of the picture and of its bytes.
 ENCODINGS = {"rgb8": ("RGB", "RGB"), "bgr8": ("RGB", "BGR"), "rgba8": ("RGB", "RGBX"), "bgra8": ("RGB", "BGRX"),
              "mono8": ("L", "L"), "8UC1": ("L", "L"), "8UC3": ("RGB", "BGR")}
+# The server's limits of angular velocities and accelerations, rad/s and m/s².
+MOST = 100.0, 1_000.0
 # The acceleration of a robot that drives is averaged over this time for the direction of gravity, seconds.
 AVERAGED_S = 1.0
 
@@ -96,10 +98,25 @@ def distortion(model, coefficients):
     return geometry_pb2.DISTORTION_MODEL_BROWN_CONRADY, coefficients[:5]
 
 
-def measured_odometry(message, base_frame, drift):
-    """The nav_msgs/Odometry of the wheels. Its own covariance is not taken: drivers rarely mean it."""
+def measured_odometry(message, base_frame, drift, with_covariance):
+    """The nav_msgs/Odometry of the wheels. `with_covariance` takes the covariance of its twist, unless that is zero."""
+    covariance = list(message.twist.covariance) if with_covariance else []
     return odometry_pb2.MeasuredOdometry(pose=wire_pose(message.pose.pose, "", base_frame),
-                                         translation_share=drift, rotation_share=drift)
+                                         translation_share=drift, rotation_share=drift,
+                                         velocity_covariance=covariance if any(covariance) else [])
+
+
+def inertial_sample(imu):
+    """The sample of a sensor_msgs/Imu, or None of one without an angular velocity and an acceleration that the server takes."""
+    vectors = [[getattr(vector, axis) for axis in "xyz"] for vector in (imu.angular_velocity, imu.linear_acceleration)]
+    # A covariance that begins with -1 says that there is no measurement.
+    is_missing = imu.angular_velocity_covariance[0] < 0 or imu.linear_acceleration_covariance[0] < 0
+    is_usable = all(abs(value) <= most for vector, most in zip(vectors, MOST) for value in vector)
+    if is_missing or not is_usable:
+        return None
+    rate, acceleration = (geometry_pb2.Vector3(x=x, y=y, z=z) for x, y, z in vectors)
+    return odometry_pb2.InertialSample(timestamp_ns=nanoseconds(imu.header.stamp),
+                                       angular_velocity=rate, linear_acceleration=acceleration)
 
 
 class Gravity:

@@ -10,6 +10,15 @@ from seese3.v1 import odometry_pb2, odometry_pb2_grpc
 FRAMES = 2
 # Requests other than frames, such as an initial pose, that may wait for the server; the oldest is dropped for another.
 WAITING = 8
+# Most inertial samples of a frame: the server's limit.
+SAMPLES = 2_000
+
+
+def keep_samples(dropped, following):
+    """Gives the inertial samples of a dropped frame to the one that follows it."""
+    samples = [*dropped.inertial_samples, *following.inertial_samples][-SAMPLES:]
+    del following.inertial_samples[:]
+    following.inertial_samples.extend(samples)
 
 
 class Requests:
@@ -26,6 +35,8 @@ class Requests:
             is_dropped = len(alike) >= (FRAMES if is_frame else WAITING)
             if is_dropped:
                 self.waiting.remove(alike[0])
+                if is_frame:
+                    keep_samples(alike[0].frame, (alike[1:] or [request])[0].frame)
             self.waiting.append(request)
             self.changed.notify_all()
             return is_dropped

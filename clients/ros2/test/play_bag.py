@@ -88,7 +88,15 @@ def turn_rate(before, base):
     return axis / max(sine, 1e-12) * numpy.arcsin(min(1.0, sine)) / (PERIOD_NS * 1e-9)
 
 
-def sensor_messages(row, bases):
+def acceleration(row, bases):
+    """The acceleration of the base in the room, by central differences; 0 at the ends."""
+    if row in (0, len(bases) - 1):
+        return numpy.zeros(3)
+    before, now, after = bases[row - 1:row + 2, :3, 3]
+    return (before - 2 * now + after) / (PERIOD_NS * 1e-9) ** 2
+
+
+def sensor_messages(row, bases, has_acceleration):
     base, begin = bases[row], bases[0]
     wheels = stamped(Odometry, row, "wheel_odom")
     since = numpy.linalg.inv(begin) @ base
@@ -99,13 +107,14 @@ def sensor_messages(row, bases):
     imu = stamped(Imu, row, "base_link")
     imu.orientation_covariance[0] = -1.0
     seen = imu.linear_acceleration
-    seen.x, seen.y, seen.z = -9.81 * base[:3, :3].T @ GRAVITY_IN_MAP
+    moved = acceleration(row, bases) if has_acceleration else numpy.zeros(3)
+    seen.x, seen.y, seen.z = base[:3, :3].T @ (moved - 9.81 * GRAVITY_IN_MAP)
     rate = imu.angular_velocity
     rate.x, rate.y, rate.z = turn_rate(bases[max(0, row - 1)], base)
     return wheels, imu
 
 
-def record(path, images, bases, camera):
+def record(path, images, bases, camera, has_acceleration):
     """Writes the bag: what sensors say before the image of the same time."""
     with Writer(path, version=9) as writer:
         connections = {}
@@ -118,7 +127,7 @@ def record(path, images, bases, camera):
 
         for row, file in enumerate(images):
             compressed, raw, info = image_messages(row, file, camera)
-            wheels, imu = sensor_messages(row, bases)
+            wheels, imu = sensor_messages(row, bases, has_acceleration)
             write("/camera_info", info, row)
             write("/wheels", wheels, row)
             write("/imu", imu, row)
@@ -161,12 +170,13 @@ def main():
     parser = argparse.ArgumentParser()
     for name in ("images", "numpy", "server", "room", "adapter"):
         parser.add_argument(f"--{name}", required=True)
+    parser.add_argument("--inertial", action="store_true", help="integrate the samples of ~/imu")
     given = parser.parse_args()
 
     stand_in.Node.given = {
         "server": given.server, "room": given.room, "adapter": given.adapter, "use_camera_info": True,
         "base_from_camera": BASE_FROM_CAMERA, "gravity_in_map": [float(value) for value in GRAVITY_IN_MAP],
-        "other_cameras": ["second"], "second.base_from_camera": BASE_FROM_CAMERA,
+        "other_cameras": ["second"], "second.base_from_camera": BASE_FROM_CAMERA, "inertial": given.inertial,
     }
     node = bridge_node.Bridge()
     sent = []
@@ -179,7 +189,7 @@ def main():
     images = sorted(Path(given.images).glob("*.png"))
     assert len(images) == len(bases), f"{len(images)} images, {len(bases)} poses"
     with tempfile.TemporaryDirectory() as folder:
-        record(Path(folder) / "bag", images, bases, camera_of(node.channel, given.room))
+        record(Path(folder) / "bag", images, bases, camera_of(node.channel, given.room), given.inertial)
         count = play(Path(folder) / "bag", node)
 
     poses = node.published["~/pose"].messages
@@ -194,7 +204,10 @@ def main():
           f"{numpy.median(off):.3f} m, of standing still {numpy.median(standing):.3f} m; TRACKING {tracking:.2f}")
     assert node.counts["refusals"] == 0, node.logger.lines
     assert len(sent) == count and all(len(frame.other_views) == 1 for frame in sent)
-    assert all(frame.HasField("gravity") and frame.HasField("odometry") for frame in sent)
+    assert all(frame.HasField("odometry") and frame.HasField("gravity") != given.inertial for frame in sent)
+    # Where the path jumps from one visit to the next, the acceleration is none that the server takes.
+    with_samples = sum(len(frame.inertial_samples) == 1 for frame in sent)
+    assert count - 4 <= with_samples <= count if given.inertial else with_samples == 0
     assert len(node.published["~/odom"].messages) == count and tracking > 0.6
     assert numpy.median(off) < 0.05 < numpy.median(standing)
     assert any(len(transforms) == 2 for transforms in node.broadcaster.sent), "TF of map was never sent"

@@ -9,6 +9,7 @@ from PIL import Image as Picture
 
 stand_in.install()
 
+from nav_msgs.msg import Odometry  # noqa: E402
 from seese3.v1 import odometry_pb2  # noqa: E402
 from seese3_bridge import requests  # noqa: E402
 from seese3_bridge.stream import Requests  # noqa: E402
@@ -157,3 +158,26 @@ def test_only_the_newest_frames_wait():
     second = waiting.of_call(waiting.begin())
     assert list(sent) == []
     assert next(second).frame.sequence == 4
+
+
+def test_an_inertial_sample_is_what_the_message_says():
+    message = imu(2, (0.1, 0.2, 9.8))
+    message.header.stamp.nanosec = 5
+    message.angular_velocity.y = -0.5
+    sample = requests.inertial_sample(message)
+    assert sample.timestamp_ns == 2_000_000_005 and sample.angular_velocity.y == -0.5
+    assert [getattr(sample.linear_acceleration, axis) for axis in "xyz"] == [0.1, 0.2, 9.8]
+
+    # By REP-145 a covariance that begins with -1 says that there is no such measurement.
+    message.angular_velocity_covariance[0] = -1.0
+    assert requests.inertial_sample(message) is None
+    assert requests.inertial_sample(imu(0, (math.nan, 0.0, 9.8))) is None
+
+
+def test_the_covariance_of_wheels_is_taken_if_it_is_asked_for():
+    message = Odometry()
+    message.twist.covariance = [float(number % 7 == 0) for number in range(36)]
+    known = [requests.measured_odometry(message, "base_link", 0.05, asked).velocity_covariance for asked in (True, False)]
+    assert list(known[0]) == list(message.twist.covariance) and not known[1]
+    message.twist.covariance = [0.0] * 36
+    assert not requests.measured_odometry(message, "base_link", 0.05, True).velocity_covariance

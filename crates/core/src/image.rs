@@ -29,13 +29,15 @@ impl RgbImage {
     /// is averaged out.
     pub fn is_blank(&self) -> bool {
         let mut parts = [(0_u64, 0_u64); BLANK_GRID.0 * BLANK_GRID.1];
-        for y in 0..self.height {
-            let row = y * BLANK_GRID.1 / self.height;
-            for x in 0..self.width {
-                let column = x * BLANK_GRID.0 / self.width;
-                let (sum, count) = &mut parts[row * BLANK_GRID.0 + column];
-                *sum += self.pixel(x, y).map(u64::from).iter().sum::<u64>();
-                *count += 3;
+        // Byte of a row at which a column of the grid begins: x · columns / width rounds down.
+        let begins = |column: usize| 3 * (column * self.width).div_ceil(BLANK_GRID.0);
+        for (y, row) in self.bytes.chunks_exact(3 * self.width.max(1)).enumerate() {
+            let of_row = y * BLANK_GRID.1 / self.height * BLANK_GRID.0;
+            for (column, (sum, count)) in parts[of_row..][..BLANK_GRID.0].iter_mut().enumerate() {
+                let cell = &row[begins(column)..begins(column + 1)];
+                let in_row: u32 = cell.iter().map(|&value| u32::from(value)).sum();
+                *sum += u64::from(in_row);
+                *count += cell.len() as u64;
             }
         }
 

@@ -113,6 +113,12 @@ impl Keypoints {
         let width = self.descriptor_width();
         &self.descriptors[place * width..(place + 1) * width]
     }
+
+    /// The descriptors of all keypoints, in 8 bit.
+    pub fn descriptors(&self) -> impl ExactSizeIterator<Item = &[i8]> {
+        let width = self.descriptor_width();
+        (0..self.len()).map(move |place| &self.descriptors[place * width..(place + 1) * width])
+    }
 }
 
 #[cfg(test)]

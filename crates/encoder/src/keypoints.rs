@@ -128,9 +128,13 @@ impl<'a> KeypointMaps<'a> {
     /// The probability of a keypoint at each pixel, shape (8h, 8w).
     fn probabilities(&self) -> Array2<f32> {
         let (_, rows, columns) = self.positions.dim();
-        Array2::from_shape_fn((rows * CELL, columns * CELL), |(y, x)| {
-            self.positions[(y % CELL * CELL + x % CELL, y / CELL, x / CELL)]
-        })
+        let mut probabilities = Array2::zeros((rows * CELL, columns * CELL));
+        for (pixel, of_cells) in self.positions.outer_iter().take(CELL * CELL).enumerate() {
+            let (y, x) = (pixel / CELL, pixel % CELL);
+            let mut to = probabilities.slice_mut(ndarray::s![y..;CELL, x..;CELL]);
+            to.assign(&of_cells);
+        }
+        probabilities
     }
 
     /// The descriptors of the cells with unit length, shape (h, w, c).

@@ -16,6 +16,8 @@ use super::{Error, RuntimeKind};
 const NAME: &str = "onnxruntime";
 /// The session option for the folder of external weight files.
 const WEIGHTS_FOLDER: &str = "session.model_external_initializers_file_folder_path";
+/// The session option for threads that wait by spinning: they use whole cores between runs.
+const SPINNING: &str = "session.intra_op.allow_spinning";
 
 /// The loaded library, or why it could not be loaded. It is loaded once per process.
 static LOADED: OnceLock<Result<Environment, String>> = OnceLock::new();
@@ -45,6 +47,8 @@ impl OnnxRuntime {
         let builder = Session::builder(environment).map_err(|error| failed(&error))?;
         let mut builder = builder
             .with_intra_threads(runtime.threads)
+            .map_err(|error| failed(&error))?
+            .with_config_entry(SPINNING, "0")
             .map_err(|error| failed(&error))?;
 
         // A model opened from memory needs this folder to find its external weights.

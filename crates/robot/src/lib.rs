@@ -68,6 +68,7 @@
 //! clock or the environment. Random numbers come from explicit seeds.
 
 pub mod matched_views;
+pub mod inertial;
 pub mod two_view;
 pub mod visual_odometry;
 pub mod tracking;

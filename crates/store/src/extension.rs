@@ -122,8 +122,15 @@ impl Store {
     }
 }
 
+impl ExtendedRoom {
+    /// The room, its features and its keypoints.
+    pub(super) fn into_parts(self) -> (Room, Vec<Features>, Option<RoomKeypoints>) {
+        (self.room, self.features, self.keypoints)
+    }
+}
+
 /// Appends the frames of `addition` to those of `base`.
-fn extended(
+pub(super) fn extended(
     base: &StoredRoom,
     addition: RoomContents<'_>,
     others: OtherFeatures,

@@ -12,6 +12,7 @@ use seese3_core::features::FeatureSource;
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::room::{Provenance, RoomId};
 use seese3_core::splits::{Split, StrideRange};
+use seese3_robot::pose_filter::FilterParameters;
 
 /// The body of a room's manifest.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -33,6 +34,9 @@ pub struct RoomBody {
     /// Keypoints with inverse depths, of a room encoded by a model with keypoint heads.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub keypoints: Option<KeypointsEntry>,
+    /// Parameters of filters that track cameras in the room, if they were fitted to it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tracking: Option<FilterParameters>,
     pub provenance: Provenance,
 }
 

@@ -53,6 +53,7 @@ mod room_fit;
 mod rooms;
 mod adapter_files;
 mod extension;
+mod map_edits;
 mod adapters;
 
 pub use adapter_files::{check_adapter_files, stated_weights_size};
@@ -61,6 +62,7 @@ pub use contents::{Contents, RevisionContents};
 pub use defaults::{Choice, Defaults, StandingDefaults};
 pub use extension::{ExtendedRoom, OtherFeatures};
 pub use garbage::{Garbage, GarbageFile};
+pub use map_edits::EditedRoom;
 pub use removal::Removed;
 pub use resource::{Kind, ResourceName, ResourceNameError};
 pub use room_keypoints::{HeaderError, KeypointsHeader, RoomKeypoints};
@@ -162,6 +164,18 @@ pub enum Error {
     OtherFrames { room: String, revision: u64 },
     #[error("frames cannot be added to room '{room}': {problem}")]
     CannotAdd {
+        room: String,
+        #[source]
+        problem: Cause,
+    },
+    #[error("the tracking parameters of room '{room}' cannot be published: {problem}")]
+    TrackingParameters {
+        room: String,
+        #[source]
+        problem: seese3_robot::pose_filter::ParameterError,
+    },
+    #[error("room '{room}' cannot be changed like that: {problem}")]
+    CannotEdit {
         room: String,
         #[source]
         problem: Cause,

@@ -17,6 +17,7 @@ use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::Pose;
 use seese3_core::keypoints::KeypointSource;
 use seese3_core::room::{Frames, Provenance, Room, RoomId, is_plain_name};
+use seese3_robot::pose_filter::FilterParameters;
 
 /// A room loaded from the store, with its features.
 #[derive(Debug, Clone)]
@@ -31,6 +32,8 @@ pub struct StoredRoom {
     pub features: Vec<Features>,
     /// The keypoints of the room, if it has any.
     pub keypoints: Option<RoomKeypoints>,
+    /// Parameters of filters that track cameras in the room, if they were fitted to it.
+    pub tracking: Option<FilterParameters>,
 }
 
 impl StoredRoom {
@@ -114,6 +117,7 @@ fn room_body(room: &Room, objects: &RoomObjects, revision: u64) -> RoomBody {
         images: objects.images.clone(),
         features: objects.features.clone(),
         keypoints: objects.keypoints.clone(),
+        tracking: None,
         provenance: room.provenance().clone(),
     }
 }
@@ -220,6 +224,58 @@ impl Store {
         self.publish_over(contents, PublishPolicy::SameFrames).await
     }
 
+    /// Publishes the newest revision of a room with other parameters of filters, or without any: that is
+    /// the next revision, unless they are the same.
+    ///
+    /// # Errors
+    /// [`Error::TrackingParameters`] for parameters that no filter can have, [`Error::Unknown`] without the
+    /// room, [`Error::Contended`] if others keep publishing it.
+    pub async fn publish_tracking(
+        &self,
+        name: &str,
+        tracking: Option<FilterParameters>,
+    ) -> Result<Published, Error> {
+        let tracking = tracking.map(FilterParameters::without_settings);
+        if let Some(Err(problem)) = tracking.map(|tracking| tracking.check()) {
+            return Err(Error::TrackingParameters {
+                room: name.to_owned(),
+                problem,
+            });
+        }
+
+        for _ in 0..ATTEMPTS {
+            let (folder, revision) = self.resolve(Kind::Room, name, None).await?;
+            let newest = self.room_body(&folder, revision).await?;
+            let numbers = self.revisions(&folder).await?;
+            // A revision that was published meanwhile would be lost.
+            if numbers.present.last() != Some(&revision) {
+                continue;
+            }
+            let body = RoomBody {
+                revision: numbers.highest + 1,
+                created: chrono::Utc::now().to_rfc3339(),
+                tracking,
+                ..newest.clone()
+            };
+            if let Some(unchanged) = unchanged(&folder, &body, Some(newest)) {
+                return Ok(unchanged);
+            }
+
+            let manifest = revision_path(&folder, body.revision).to_string();
+            let bytes = manifest::encode(&manifest, &body)?;
+            if self.write_manifest(&folder, body.revision, bytes).await? {
+                return Ok(Published {
+                    revision: body.revision,
+                    is_new: true,
+                    manifest,
+                });
+            }
+        }
+        Err(Error::Contended {
+            name: name.to_owned(),
+        })
+    }
+
     /// Publishes a room like [`Store::publish_room`], under the condition `over`.
     ///
     /// # Errors
@@ -272,6 +328,7 @@ impl Store {
             }
 
             if let Some(newest) = &newest {
+                body.tracking = newest.tracking;
                 if newest.frames == body.frames || self.has_poses(&folder, newest, room).await? {
                     let kept = features_to_keep(newest, &objects.features);
                     body.features.extend(kept);
@@ -727,6 +784,13 @@ impl Store {
             features.push(set);
         }
 
+        if let Some(tracking) = &body.tracking {
+            tracking.check().map_err(|error| Error::Damaged {
+                file: self.shown(&revision_path(&folder, revision)),
+                problem: format!("tracking.{error}").into(),
+            })?;
+        }
+
         let keypoints = match body.keypoints {
             Some(entry) => {
                 let (file, bytes) = self.read_object(&folder, &entry.object).await?;
@@ -742,6 +806,7 @@ impl Store {
             created: body.created,
             features,
             keypoints,
+            tracking: body.tracking,
         })
     }
 

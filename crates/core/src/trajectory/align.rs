@@ -159,7 +159,8 @@ impl Similarity {
         })
     }
 
-    fn pose(&self, pose: &Pose) -> Pose {
+    /// A pose of the estimate's world in the reference's.
+    pub fn pose(&self, pose: &Pose) -> Pose {
         let scaled = Pose::from_parts(
             Translation3::from(pose.translation.vector * self.scale),
             pose.rotation,

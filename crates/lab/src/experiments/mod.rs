@@ -28,15 +28,18 @@ pub mod motion;
 pub mod odometry;
 pub mod odometry_scenarios;
 pub mod path_comparison;
+pub mod mapless;
 mod mapped_room;
 pub mod planning;
 mod player;
 pub mod probe;
 pub mod replay;
+mod simulated_sensors;
 pub mod robustness;
 pub mod seeds;
 mod simple_planners;
 pub mod tracked_room;
+pub mod tracking_fit;
 pub mod tracking_scores;
 
 use seese3_core::room::Room;

@@ -1,17 +1,16 @@
-//! What happens to robots: parts without a map, kidnaps, and wheels. Each scenario replays tracked
-//! frames of a room, beside simple baselines on the same frames.
+//! What happens to robots: parts without a map or without images, kidnaps, wheels and inertial
+//! sensors. Each scenario replays tracked frames of a room, beside simple baselines on the same frames.
 
-use nalgebra::Vector3;
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 
-use super::player::{PlayedView, Player, Sight};
+use super::mapless::MaplessDrift;
+use super::player::{PlayedView, Player, Sensed, Sight};
+use super::simulated_sensors::{inertial, wheels};
 use super::tracking_scores::is_wrong;
 use crate::json;
 use seese3_core::geometry::{Pose, PoseError, Twist, body_twist, exp};
 use seese3_core::statistics::{median, root_mean_square};
-use seese3_robot::tracking::{Drift, MeasuredPose, PoseWithCovariance, Status};
+use seese3_robot::tracking::{PoseWithCovariance, Status};
 
 /// Lengths of the parts without a map, seconds.
 pub const GAPS_S: [f64; 3] = [1.0, 2.0, 5.0];
@@ -25,17 +24,6 @@ const KIDNAP_FRAMES: usize = 45;
 /// Smallest distance of a kidnap, meters.
 const LEAST_KIDNAP_M: f64 = 0.3;
 
-/// Simulated wheels: relative error of lengths, rotation per meter, and noise of each step along each
-/// axis, meters.
-const WHEEL_LENGTH_ERROR: f64 = 0.02;
-const WHEEL_TURN_RAD: f64 = 0.017_453;
-const WHEEL_NOISE_M: f64 = 5e-4;
-/// The drift that they state.
-const WHEEL_DRIFT: Drift = Drift {
-    translation_share: 0.03,
-    rotation_share: 0.03,
-};
-
 /// Results of all scenarios in one room.
 #[derive(Debug, Clone, Serialize)]
 pub struct Scenarios {
@@ -43,9 +31,40 @@ pub struct Scenarios {
     pub gaps: Vec<GapErrors>,
     /// Cameras that were carried to another place.
     pub kidnaps: Kidnaps,
+    /// Parts without images, one per length.
+    pub dark: Vec<DarkErrors>,
+    /// Odometry without a map.
+    pub mapless: MaplessDrift,
     /// Streams with simulated wheels.
-    pub wheels: WheelErrors,
+    pub wheels: SensorErrors,
+    /// Streams with a simulated inertial sensor.
+    pub inertial: SensorErrors,
 }
+
+/// Position errors of the map pose at the end of a part without images, meters. In JSON, medians.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct DarkErrors {
+    /// Length of the part, seconds.
+    pub seconds: f64,
+    /// Without another sensor.
+    #[serde(rename = "alone_m", serialize_with = "as_median")]
+    pub alone: Vec<f64>,
+    /// With simulated wheels.
+    #[serde(rename = "wheels_m", serialize_with = "as_median")]
+    pub wheels: Vec<f64>,
+    /// With a simulated inertial sensor.
+    #[serde(rename = "inertial_m", serialize_with = "as_median")]
+    pub inertial: Vec<f64>,
+    /// Of the last map pose before the part.
+    #[serde(rename = "standing_still_m", serialize_with = "as_median")]
+    pub standing_still: Vec<f64>,
+    /// Squared Mahalanobis lengths of the errors with an inertial sensor.
+    #[serde(rename = "inertial_coverage", serialize_with = "json::coverages")]
+    pub inertial_surprises: Vec<f64>,
+}
+
+/// A simulation of the sensors of a stream, with a seed.
+type Simulation = fn(&[PlayedView<'_>], u64) -> Vec<Sensed>;
 
 /// Position errors at the end of a part without a map, meters.
 #[derive(Debug, Clone, Default, Serialize)]
@@ -83,13 +102,13 @@ pub struct Kidnaps {
     pub recovered_after: Vec<f64>,
 }
 
-/// Root-mean-square position errors of streams with simulated wheels, meters.
+/// Root-mean-square position errors of streams with a simulated sensor, meters.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct WheelErrors {
-    /// The map pose, with wheels.
+pub struct SensorErrors {
+    /// The map pose, with the sensor.
     pub fused: f64,
-    /// The wheels alone, from the true first pose.
-    pub wheels_alone: f64,
+    /// The sensor alone, from the true first pose, if it measures poses.
+    pub alone: Option<f64>,
     /// Fraction of TRACKING frames.
     pub tracking: f64,
 }
@@ -109,15 +128,23 @@ impl Scenarios {
             seconds,
             ..GapErrors::default()
         });
+        let mut dark = GAPS_S.map(|seconds| DarkErrors {
+            seconds,
+            ..DarkErrors::default()
+        });
         let mut kidnaps = Kidnaps::default();
         for views in streams {
+            add_dark(&mut dark, views, player);
             add_gaps(&mut gaps, views, player(first_pose(views)));
             kidnaps.add(views, &|| player(None));
         }
         Self {
             gaps: gaps.to_vec(),
             kidnaps,
-            wheels: with_wheels(streams, player),
+            dark: dark.to_vec(),
+            mapless: MaplessDrift::of(streams, player),
+            wheels: with_sensors(streams, player, wheels),
+            inertial: with_sensors(streams, player, inertial),
         }
     }
 
@@ -132,6 +159,13 @@ impl Scenarios {
                 gap.constant_velocity.extend(&other.constant_velocity);
                 gap.surprises.extend(&other.surprises);
             }
+            for (dark, other) in together.dark.iter_mut().zip(&room.dark) {
+                dark.alone.extend(&other.alone);
+                dark.wheels.extend(&other.wheels);
+                dark.inertial.extend(&other.inertial);
+                dark.standing_still.extend(&other.standing_still);
+                dark.inertial_surprises.extend(&other.inertial_surprises);
+            }
             let kidnaps = &mut together.kidnaps;
             kidnaps.n += room.kidnaps.n;
             kidnaps.tracking += room.kidnaps.tracking;
@@ -142,15 +176,22 @@ impl Scenarios {
         }
 
         let count = rooms.clone().count() as f64;
-        let mean = |of: fn(&WheelErrors) -> f64| {
-            let all = rooms.clone().map(|room| of(&room.wheels));
-            all.sum::<f64>() / count
+        let mean = |errors: &[SensorErrors]| {
+            let of =
+                |value: fn(&SensorErrors) -> f64| errors.iter().map(value).sum::<f64>() / count;
+            SensorErrors {
+                fused: of(|errors| errors.fused),
+                alone: errors[0]
+                    .alone
+                    .map(|_| of(|errors| errors.alone.unwrap_or(0.0))),
+                tracking: of(|errors| errors.tracking),
+            }
         };
-        together.wheels = WheelErrors {
-            fused: mean(|errors| errors.fused),
-            wheels_alone: mean(|errors| errors.wheels_alone),
-            tracking: mean(|errors| errors.tracking),
-        };
+        together.mapless = MaplessDrift::mean(rooms.clone().map(|room| &room.mapless));
+        let wheels: Vec<SensorErrors> = rooms.clone().map(|room| room.wheels).collect();
+        let inertial: Vec<SensorErrors> = rooms.map(|room| room.inertial).collect();
+        together.wheels = mean(&wheels);
+        together.inertial = mean(&inertial);
         Some(together)
     }
 }
@@ -167,7 +208,7 @@ fn seconds_between(from: &PlayedView<'_>, to: &PlayedView<'_>) -> f64 {
 fn add_gaps(gaps: &mut [GapErrors], views: &[PlayedView<'_>], mut player: Player<'_>) {
     let mut next_s = GAP_EVERY_S;
     for (row, view) in views.iter().enumerate() {
-        let update = player.step(view, Sight::Mapped, None);
+        let update = player.step(view, Sight::Mapped, &Sensed::default());
         let is_due = seconds_between(&views[0], view) >= next_s;
         let pose = update.and_then(|update| update.map_pose);
         let Some(pose) = pose.filter(|_| is_due) else {
@@ -185,7 +226,7 @@ fn add_gaps(gaps: &mut [GapErrors], views: &[PlayedView<'_>], mut player: Player
         let mut branch = player.clone();
         let mut ends = gaps.iter_mut().peekable();
         for later in &views[row + 1..] {
-            let update = branch.step(later, Sight::Unmapped, None);
+            let update = branch.step(later, Sight::Unmapped, &Sensed::default());
             let seconds = seconds_between(view, later);
             let Some(gap) = ends.next_if(|gap| seconds >= gap.seconds) else {
                 if ends.peek().is_none() {
@@ -203,6 +244,53 @@ fn add_gaps(gaps: &mut [GapErrors], views: &[PlayedView<'_>], mut player: Player
             let fused: PoseWithCovariance = fused.unwrap_or(pose);
             gap.fused.push(error_m(&fused.pose));
             gap.surprises.extend(fused.squared_error(&later.truth));
+        }
+    }
+}
+
+/// Adds the errors at the ends of parts without images: without another sensor, and with each.
+fn add_dark<'a>(
+    dark: &mut [DarkErrors],
+    views: &[PlayedView<'a>],
+    player: &dyn Fn(Option<Pose>) -> Player<'a>,
+) {
+    let none: Simulation = |views, _| vec![Sensed::default(); views.len()];
+    for (number, simulated) in [none, wheels, inertial].into_iter().enumerate() {
+        let sensed = simulated(views, 0);
+        let mut player = player(first_pose(views));
+        let mut next_s = GAP_EVERY_S;
+        for (row, view) in views.iter().enumerate() {
+            let update = player.step(view, Sight::Mapped, &sensed[row]);
+            let is_due = seconds_between(&views[0], view) >= next_s;
+            let pose = update.and_then(|update| update.map_pose);
+            let Some(pose) = pose.filter(|_| is_due) else {
+                continue;
+            };
+
+            next_s += GAP_EVERY_S;
+            let mut branch = player.clone();
+            let mut ends = dark.iter_mut().peekable();
+            for (later, sensed) in views.iter().zip(&sensed).skip(row + 1) {
+                let update = branch.step(later, Sight::Dark, sensed);
+                let seconds = seconds_between(view, later);
+                let Some(end) = ends.next_if(|end| seconds >= end.seconds) else {
+                    continue;
+                };
+                let error_m = |pose: &Pose| PoseError::between(pose, &later.truth).translation_m;
+                let fused = update.and_then(|update| update.map_pose).unwrap_or(pose);
+                let of_sensor = [&mut end.alone, &mut end.wheels, &mut end.inertial];
+                of_sensor[number].push(error_m(&fused.pose));
+                if number == 0 {
+                    end.standing_still.push(error_m(&pose.pose));
+                }
+                if number == 2 {
+                    let surprise = fused.squared_error(&later.truth);
+                    end.inertial_surprises.extend(surprise);
+                }
+                if ends.peek().is_none() {
+                    break;
+                }
+            }
         }
     }
 }
@@ -227,7 +315,7 @@ impl Kidnaps {
 
             let mut player = player();
             for view in before {
-                player.step(view, Sight::Mapped, None);
+                player.step(view, Sight::Mapped, &Sensed::default());
             }
             self.n += 1;
             self.distances_m.push(distance);
@@ -240,7 +328,7 @@ impl Kidnaps {
                     sequence: last.sequence + 1 + place as u64,
                     ..*view
                 };
-                let Some(update) = player.step(&view, Sight::Mapped, None) else {
+                let Some(update) = player.step(&view, Sight::Mapped, &Sensed::default()) else {
                     continue;
                 };
                 let tracked = update
@@ -261,58 +349,38 @@ impl Kidnaps {
     }
 }
 
-/// Streams with simulated wheels.
-fn with_wheels<'a>(
+/// Streams with simulated sensors.
+fn with_sensors<'a>(
     streams: &[&[PlayedView<'a>]],
     player: &dyn Fn(Option<Pose>) -> Player<'a>,
-) -> WheelErrors {
+    simulated: Simulation,
+) -> SensorErrors {
     let (mut fused, mut alone) = (Vec::new(), Vec::new());
     let mut tracking = 0;
+    let mut count = 0;
     for (number, views) in streams.iter().enumerate() {
         let Some(first) = first_pose(views) else {
             continue;
         };
-        let wheels = simulated_wheels(views, number as u64);
+        let sensed = simulated(views, number as u64);
         let mut player = player(Some(first));
-        for (view, pose) in views.iter().zip(&wheels) {
-            let measured = MeasuredPose {
-                pose: *pose,
-                drift: WHEEL_DRIFT,
-            };
-            let update = player.step(view, Sight::Mapped, Some(measured));
+        for (view, sensed) in views.iter().zip(&sensed) {
+            count += 1;
             let error_m = |pose: &Pose| PoseError::between(pose, &view.truth).translation_m;
-            alone.push(error_m(&(first * wheels[0].inv_mul(pose))));
+            alone.extend(
+                sensed
+                    .measured
+                    .map(|measured| error_m(&(first * measured.pose))),
+            );
+            let update = player.step(view, Sight::Mapped, sensed);
             let Some(update) = update else { continue };
             tracking += usize::from(update.status == Status::Tracking);
             fused.extend(update.map_pose.map(|pose| error_m(&pose.pose)));
         }
     }
-    WheelErrors {
+    SensorErrors {
         fused: root_mean_square(&fused),
-        wheels_alone: root_mean_square(&alone),
-        tracking: tracking as f64 / alone.len() as f64,
+        alone: (!alone.is_empty()).then(|| root_mean_square(&alone)),
+        tracking: tracking as f64 / count as f64,
     }
-}
-
-/// Poses by wheels with a wrong length, a rotation per meter about the image's vertical axis, and
-/// noise.
-fn simulated_wheels(views: &[PlayedView<'_>], seed: u64) -> Vec<Pose> {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut sign = || if rng.random_bool(0.5) { 1.0 } else { -1.0 };
-    let length = 1.0 + sign() * WHEEL_LENGTH_ERROR;
-    let turn_rad = sign() * WHEEL_TURN_RAD;
-
-    let mut pose = Pose::identity();
-    let mut poses = vec![pose];
-    for pair in views.windows(2) {
-        let motion = body_twist(&pair[0].truth, &pair[1].truth);
-        let noise = Vector3::from_fn(|_, _| rng.random_range(-1.0..1.0) * 3_f64.sqrt());
-        let turn = Vector3::y() * (turn_rad * motion.linear.norm());
-        pose *= exp(&Twist {
-            linear: motion.linear * length + noise * WHEEL_NOISE_M,
-            angular: motion.angular + turn,
-        });
-        poses.push(pose);
-    }
-    poses
 }

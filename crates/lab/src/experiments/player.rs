@@ -11,7 +11,9 @@ use seese3_robot::front_end::{
     FrontEnd, ImageReading, RetrievalFrontEnd, RoomCandidate, StreamImage, StreamView,
 };
 use seese3_robot::localization::KeypointRoom;
-use seese3_robot::pose_filter::{FilterState, MeasuredGravity, PoseFilter, ViewObservation};
+use seese3_robot::pose_filter::{
+    FilterState, MeasuredGravity, MeasuredInertia, PoseFilter, ViewObservation,
+};
 use seese3_robot::tracking::{Map, MeasuredPose, Status, Update};
 
 /// A view of a stream.
@@ -44,11 +46,20 @@ pub(super) enum ViewInput<'a> {
     },
 }
 
+/// What the sensors of a robot say at a view.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Sensed {
+    pub measured: Option<MeasuredPose>,
+    pub inertia: Option<MeasuredInertia>,
+}
+
 /// Whether the views of a stream are compared with the map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Sight {
     Mapped,
     Unmapped,
+    /// There is no image.
+    Dark,
 }
 
 /// Plays a stream, view by view.
@@ -79,19 +90,37 @@ pub(super) enum Reader<'a> {
 
 impl Player<'_> {
     /// Adds a view; `None` if the filter refuses it.
-    pub fn step(
+    pub fn step(&mut self, view: &PlayedView<'_>, sight: Sight, sensed: &Sensed) -> Option<Update> {
+        let observation = self.observation(view, sight, sensed);
+        self.observe(&observation)
+    }
+
+    /// What the filter is told of a view.
+    pub fn observation(
         &mut self,
         view: &PlayedView<'_>,
         sight: Sight,
-        measured: Option<MeasuredPose>,
-    ) -> Option<Update> {
-        let observation = ViewObservation {
-            measured,
+        sensed: &Sensed,
+    ) -> ViewObservation {
+        let sensed = ViewObservation {
+            measured: sensed.measured,
+            inertia: sensed.inertia.clone(),
             gravity: view.gravity,
-            ..self.reader.observation(view, sight, self.predicted)
+            ..ViewObservation::empty(view.time_ns, view.sequence)
         };
+        let motion = self.filter.sensed_motion(&self.state, &sensed);
+        let read = self.reader.observation(view, sight, self.predicted, motion);
+        ViewObservation {
+            measured: sensed.measured,
+            inertia: sensed.inertia,
+            gravity: sensed.gravity,
+            ..read
+        }
+    }
 
-        let update = self.filter.observe(&mut self.state, &observation).ok()?;
+    /// Tells the filter; `None` if it refuses the frame.
+    pub fn observe(&mut self, observation: &ViewObservation) -> Option<Update> {
+        let update = self.filter.observe(&mut self.state, observation).ok()?;
         let is_located = update.status == Status::Tracking && update.match_used;
         let tracked = update.map_pose.filter(|_| is_located);
         self.predicted = tracked.map(|tracked| tracked.pose);
@@ -105,7 +134,9 @@ impl Reader<'_> {
         view: &PlayedView<'_>,
         sight: Sight,
         predicted: Option<Pose>,
+        motion: Option<Pose>,
     ) -> ViewObservation {
+        let predicted = predicted.map(|pose| motion.map_or(pose, |motion| pose * motion));
         match (self, view.input) {
             (
                 Self::Keypoints {
@@ -120,6 +151,10 @@ impl Reader<'_> {
                     ..
                 },
             ) => {
+                if sight == Sight::Dark {
+                    front_end.skip(view.time_ns);
+                    return ViewObservation::empty(view.time_ns, view.sequence);
+                }
                 let fingerprint = (!keypoints.is_empty()).then_some(fingerprint);
                 let candidate = RoomCandidate {
                     index: 0,
@@ -132,11 +167,11 @@ impl Reader<'_> {
                     height: *height,
                     fingerprint,
                     predicted,
-                    predicted_motion: None,
+                    predicted_motion: motion,
                 };
                 let candidates = match sight {
                     Sight::Mapped => vec![candidate],
-                    Sight::Unmapped => Vec::new(),
+                    Sight::Unmapped | Sight::Dark => Vec::new(),
                 };
                 let read = front_end.read(&image, &candidates);
                 read.observation(view.time_ns, view.sequence, fingerprint)
@@ -154,11 +189,11 @@ impl Reader<'_> {
                     other: None,
                     latent,
                     feature: Some(&feature),
-                    is_blank,
+                    is_blank: is_blank || sight == Sight::Dark,
                 };
                 let maps = match sight {
                     Sight::Mapped => std::slice::from_ref(*map),
-                    Sight::Unmapped => &[],
+                    Sight::Unmapped | Sight::Dark => &[],
                 };
                 let read = front_end.read(&[view_of_stream], maps, None);
                 read.observation(&ImageReading::default(), view.time_ns, view.sequence)

@@ -15,12 +15,12 @@ use seese3_core::trajectory::Trajectory;
 use seese3_robot::fitting::{RoomReader, fit};
 use seese3_robot::front_end::{FrontEnd, RetrievalFrontEnd, StreamCamera};
 use seese3_robot::localization::KeypointRoom;
-use seese3_robot::pose_filter::{FilterParameters, FilterRoom, PoseFilter};
+use seese3_robot::pose_filter::{FilterParameters, FilterRoom, PoseFilter, ViewObservation};
 use seese3_robot::tracking::{Map, PoseWithCovariance, Status};
 use seese3_robot::visual_odometry::OdometryParameters;
 
 use super::matched_localization::{Baselines, PosedRecording, mapped_room};
-use super::player::{PlayedView, Player, Reader, Sight, ViewInput};
+use super::player::{PlayedView, Player, Reader, Sensed, Sight, ViewInput};
 use super::replay::{InitialPose, Replay, joined, period_ns};
 use super::robustness::{Disturbance, DisturbedTracking, PlannedFrame, down_of, plan, scored};
 use super::tracking_scores::LostFrames;
@@ -87,6 +87,17 @@ pub(super) struct Stream<'a> {
     pub views: Vec<PlayedView<'a>>,
     /// Mean frame period, nanoseconds.
     pub period_ns: i64,
+}
+
+/// The observations of a stream, with the true poses.
+pub(super) struct RecordedStream {
+    /// The initial pose.
+    pub start: Option<PoseWithCovariance>,
+    pub frames: Vec<(ViewObservation, Pose)>,
+}
+
+fn initial(pose: Pose) -> PoseWithCovariance {
+    PoseWithCovariance::known(pose, INITIAL_DEVIATION, INITIAL_DEVIATION)
 }
 
 /// Views of a disturbed camera, one per tracked frame of a room.
@@ -170,6 +181,36 @@ impl<'a> TrackedRoom<'a> {
             mapped,
             method,
         })
+    }
+
+    /// The filter of its streams.
+    pub(super) fn filter(&self) -> &PoseFilter {
+        &self.filter
+    }
+
+    /// Diagonal of the bounding box of the mapped camera positions, meters.
+    pub(super) fn extent_m(&self) -> f64 {
+        self.filter.rooms()[0].extent_m
+    }
+
+    /// The tracked streams, each from its true first pose, as the front end reads them.
+    pub(super) fn recorded(&self) -> Vec<RecordedStream> {
+        let streams = self.streams();
+        let recorded = streams.iter().map(|stream| {
+            let first = stream.views.first().map(|view| view.truth);
+            let mut player = self.player(first, stream.views.first());
+            let frames = stream.views.iter().map(|view| {
+                let observation = player.observation(view, Sight::Mapped, &Sensed::default());
+                // A frame that the filter refuses is refused again in a trial.
+                let _ = player.observe(&observation);
+                (observation, view.truth)
+            });
+            RecordedStream {
+                start: first.map(initial),
+                frames: frames.collect(),
+            }
+        });
+        recorded.collect()
     }
 
     /// The room, with all its frames.
@@ -287,7 +328,7 @@ impl<'a> TrackedRoom<'a> {
             beginnings: vec![0],
         };
         for view in views {
-            let Some(update) = player.step(view, Sight::Mapped, None) else {
+            let Some(update) = player.step(view, Sight::Mapped, &Sensed::default()) else {
                 continue;
             };
             replay.truth.times_ns.push(view.time_ns);
@@ -305,10 +346,9 @@ impl<'a> TrackedRoom<'a> {
         first: Option<Pose>,
         example: Option<&PlayedView<'_>>,
     ) -> Player<'_> {
-        let known = |pose| PoseWithCovariance::known(pose, INITIAL_DEVIATION, INITIAL_DEVIATION);
         Player {
             filter: &self.filter,
-            state: self.filter.start(first.map(known).as_ref()),
+            state: self.filter.start(first.map(initial).as_ref()),
             reader: match &self.method {
                 Method::Keypoints { map, camera, .. } => {
                     let stated = example.and_then(|view| match view.input {

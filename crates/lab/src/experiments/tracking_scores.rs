@@ -61,25 +61,34 @@ impl Drift {
     /// Drift of the odometry of a replay; parts do not cross from one stream to the next.
     fn of(replay: &Replay) -> Self {
         let truth = &replay.truth.poses;
-        let step = |pair: &[Pose]| PoseError::between(&pair[0], &pair[1]).translation_m;
-        let mut way_m = vec![0.0];
-        for pair in truth.windows(2) {
-            way_m.push(way_m[way_m.len() - 1] + step(pair));
-        }
-
+        let odom: Vec<Pose> = replay
+            .updates
+            .iter()
+            .map(|update| update.odom.pose)
+            .collect();
         let ends = replay.beginnings.iter().skip(1).copied();
         let ends = ends.chain([truth.len()]);
+        let streams = replay.beginnings.iter().zip(ends);
+        Self::of_paths(streams.map(|(&begin, end)| (&truth[begin..end], &odom[begin..end])))
+    }
+
+    /// Drift of some paths, each with its true poses.
+    pub(super) fn of_paths<'a>(paths: impl Iterator<Item = (&'a [Pose], &'a [Pose])>) -> Self {
+        let step = |pair: &[Pose]| PoseError::between(&pair[0], &pair[1]).translation_m;
         let (mut percent, mut deg_per_m) = (Vec::new(), Vec::new());
-        for (&begin, end) in replay.beginnings.iter().zip(ends) {
-            for start in begin..end {
+        for (truth, estimated) in paths {
+            let mut way_m = vec![0.0];
+            for pair in truth.windows(2) {
+                way_m.push(way_m[way_m.len() - 1] + step(pair));
+            }
+            for start in 0..truth.len() {
                 for length_m in DRIFT_LENGTHS_M {
                     let is_reached = |row: &usize| way_m[*row] - way_m[start] >= length_m;
-                    let Some(row) = (start..end).find(is_reached) else {
+                    let Some(row) = (start..truth.len()).find(is_reached) else {
                         continue;
                     };
-                    let odom = |row: usize| replay.updates[row].odom.pose;
                     let error = PoseError::between(
-                        &odom(start).inv_mul(&odom(row)),
+                        &estimated[start].inv_mul(&estimated[row]),
                         &truth[start].inv_mul(&truth[row]),
                     );
                     let length_m = way_m[row] - way_m[start];
@@ -95,7 +104,7 @@ impl Drift {
     }
 
     /// Means over rooms; rooms with shorter paths are skipped.
-    fn mean<'a>(rooms: impl Iterator<Item = &'a Self> + Clone) -> Self {
+    pub(super) fn mean<'a>(rooms: impl Iterator<Item = &'a Self> + Clone) -> Self {
         let known = rooms.filter(|drift| drift.percent.is_finite());
         Self {
             percent: mean(&known.clone().map(|drift| drift.percent).collect::<Vec<_>>()),

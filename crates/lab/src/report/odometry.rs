@@ -4,8 +4,9 @@ use serde::Serialize;
 
 use super::table::Column::{self, Number, Text};
 use super::table::{Table, fixed};
+use crate::experiments::mapless::MaplessDrift;
 use crate::experiments::odometry::{MapPoseErrors, Relocalisation, RoomOdometry, squared_errors};
-use crate::experiments::odometry_scenarios::Scenarios;
+use crate::experiments::odometry_scenarios::{DarkErrors, Scenarios};
 use crate::experiments::replay::MotionSurprise;
 use crate::experiments::tracking_scores::{StatusShares, TrackingScores};
 use crate::json;
@@ -167,8 +168,11 @@ fn scenarios(rooms: &[RoomOdometry]) -> Option<Scenarios> {
 pub fn scenarios_text(rooms: &[RoomOdometry]) -> Option<String> {
     let Scenarios {
         gaps,
+        dark,
+        mapless,
         kidnaps,
         wheels,
+        inertial,
     } = scenarios(rooms)?;
     let mut table = Table::new(
         "no view matched for | n | fused m (median) | standing still m | constant velocity m | within 68 % | within 95 %",
@@ -182,9 +186,17 @@ pub fn scenarios_text(rooms: &[RoomOdometry]) -> Option<String> {
         table.row(format!("{} s", gap.seconds), cells);
     }
 
+    let dark_table = dark_table(&dark);
+    let mapless_table = mapless_table(&mapless);
     let wheels = format!(
         "simulated wheels (2 % length, 1°/m): fused RMSE {:.3} m, wheels alone {:.3} m, TRACKING {:.3}",
-        wheels.fused, wheels.wheels_alone, wheels.tracking
+        wheels.fused,
+        wheels.alone.unwrap_or(f64::NAN),
+        wheels.tracking
+    );
+    let inertial = format!(
+        "simulated inertial sensor: fused RMSE {:.3} m, TRACKING {:.3}",
+        inertial.fused, inertial.tracking
     );
     let kidnaps = if kidnaps.n == 0 {
         "kidnaps: the streams are too short".to_owned()
@@ -205,7 +217,49 @@ pub fn scenarios_text(rooms: &[RoomOdometry]) -> Option<String> {
             kidnaps.tracking,
         )
     };
-    Some(format!("{table}\n{kidnaps}\n{wheels}"))
+    Some(format!(
+        "{table}\n{dark_table}\n{mapless_table}\n{kidnaps}\n{wheels}\n{inertial}"
+    ))
+}
+
+fn dark_table(dark: &[DarkErrors]) -> Table {
+    let mut table = Table::new(
+        "no image for | n | fused m (median) | with wheels | with inertial sensor | standing still m | of inertial within 68 % | within 95 %",
+    );
+    for dark in dark.iter().filter(|dark| !dark.alone.is_empty()) {
+        let errors = [
+            &dark.alone,
+            &dark.wheels,
+            &dark.inertial,
+            &dark.standing_still,
+        ];
+        let medians = errors.map(|errors| median(errors));
+        let cells = std::iter::once(dark.alone.len().to_string())
+            .chain(fixed(medians, 3))
+            .chain(fixed(json::covered(&dark.inertial_surprises), 3));
+        table.row(format!("{} s", dark.seconds), cells);
+    }
+    table
+}
+
+fn mapless_table(mapless: &MaplessDrift) -> Table {
+    let mut table = Table::new("odometry without a map | drift % | drift °/m");
+    for (name, drift) in [
+        ("images", &mapless.images),
+        (
+            "images, true length of the first part",
+            &mapless.images_true_length,
+        ),
+        ("images and wheels", &mapless.wheels),
+        ("wheels alone", &mapless.wheels_alone),
+        (
+            "pairs of views, true lengths",
+            &mapless.two_view_true_lengths,
+        ),
+    ] {
+        table.row(name.to_owned(), fixed([drift.percent, drift.deg_per_m], 2));
+    }
+    table
 }
 
 /// Fraction of frames of other rooms reported LOST, as text with Wilson's 95 % interval.

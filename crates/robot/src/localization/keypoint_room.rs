@@ -158,6 +158,17 @@ impl KeypointRoom {
         self.locate_among(view, Candidates::Near(predicted))
     }
 
+    /// The pose, `world_from_camera`, of a frame of another map of the same encoder; `None` if its
+    /// keypoints do not agree with this map.
+    pub fn locate_mapped(&self, other: &KeypointMap, row: usize) -> Option<Pose> {
+        let matched =
+            self.map
+                .match_mapped((other, row), &self.places, &self.poses, &self.parameters)?;
+        matched
+            .is_supported(&self.parameters)
+            .then_some(matched.pose)
+    }
+
     /// The pose of a view: near a predicted pose if there is one and it succeeds, else anywhere.
     ///
     /// # Errors

@@ -7,10 +7,12 @@
 //!   only if the view resembles the room, as far as that is known.
 
 mod adapter_localizer;
+mod alignment;
 mod camera_search;
 mod keypoint_room;
 
 pub use adapter_localizer::{AdapterEstimate, AdapterLocalizer};
+pub use alignment::{MapAlignment, NotAligned};
 pub use camera_search::FocalSearch;
 pub use keypoint_room::{KeypointRoom, LocatedView, NotLocated};
 

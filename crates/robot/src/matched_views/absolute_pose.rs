@@ -108,6 +108,32 @@ pub(crate) struct Search {
     pub seed: u64,
 }
 
+/// Coordinates of correspondences, in blocks. The last block is filled with NaN, which costs as much
+/// as an outlier.
+struct Columns {
+    /// x, y and z of the map points.
+    world: Vec<[[f64; BLOCK]; 3]>,
+    /// x and y on the plane at depth 1.
+    plane: Vec<[[f64; BLOCK]; 2]>,
+}
+
+impl Columns {
+    fn of(matches: &[Correspondence]) -> Self {
+        let mut world = vec![[[f64::NAN; BLOCK]; 3]; matches.len().div_ceil(BLOCK)];
+        let mut plane = vec![[[f64::NAN; BLOCK]; 2]; world.len()];
+        for (number, match_) in matches.iter().enumerate() {
+            let (block, place) = (number / BLOCK, number % BLOCK);
+            for (axis, values) in world[block].iter_mut().enumerate() {
+                values[place] = match_.world[axis];
+            }
+            for (axis, values) in plane[block].iter_mut().enumerate() {
+                values[place] = match_.plane[axis];
+            }
+        }
+        Self { world, plane }
+    }
+}
+
 /// A refined pose and its support.
 #[derive(Debug, Clone)]
 pub(crate) struct Found {
@@ -128,6 +154,7 @@ pub(crate) fn find_pose(matches: &[Correspondence], search: &Search) -> Option<F
         return None;
     }
 
+    let columns = Columns::of(matches);
     let mut rng = ChaCha8Rng::seed_from_u64(search.seed);
     let mut best: Option<(f64, Isometry3<f64>)> = None;
     let [least, most] = search.iterations;
@@ -144,13 +171,13 @@ pub(crate) fn find_pose(matches: &[Correspondence], search: &Search) -> Option<F
 
         for hypothesis in p3p(&directions, &points) {
             let limit = best.as_ref().map_or(f64::INFINITY, |(cost, _)| *cost);
-            let Some(cost) = search.cost(matches, &hypothesis, limit) else {
+            let Some(cost) = search.cost(&columns, &hypothesis, limit) else {
                 continue;
             };
 
             // Local optimization: refine the new best on its inliers.
             let refined = search.locally_optimized(matches, hypothesis);
-            best = match search.cost(matches, &refined, cost) {
+            best = match search.cost(&columns, &refined, cost) {
                 Some(lower) => Some((lower, refined)),
                 None => Some((cost, hypothesis)),
             };
@@ -210,17 +237,36 @@ impl Search {
     /// `limit`.
     fn cost(
         &self,
-        matches: &[Correspondence],
+        matches: &Columns,
         camera_from_world: &Isometry3<f64>,
         limit: f64,
     ) -> Option<f64> {
-        let threshold = self.threshold_px * self.threshold_px;
+        let rotation = camera_from_world.rotation.to_rotation_matrix();
+        let shift = camera_from_world.translation.vector;
+        let scale = (self.focal_px / self.threshold_px).powi(2);
         let mut cost = 0.0;
-        for block in matches.chunks(BLOCK) {
-            for match_ in block {
-                let error = self.squared_error(match_, camera_from_world) / threshold;
-                cost += error.min(1.0);
+        for (world, plane) in matches.world.iter().zip(&matches.plane) {
+            let mut errors = [0.0; BLOCK];
+            let [x, y, z] = world;
+            let [u, v] = plane;
+            for (at, error) in errors.iter_mut().enumerate() {
+                let seen = |row: usize| {
+                    rotation[(row, 0)] * x[at]
+                        + rotation[(row, 1)] * y[at]
+                        + rotation[(row, 2)] * z[at]
+                        + shift[row]
+                };
+                let depth = seen(2);
+                let dx = seen(0) / depth - u[at];
+                let dy = seen(1) / depth - v[at];
+                let squared = (dx * dx + dy * dy) * scale;
+                *error = if depth < MIN_DEPTH {
+                    1.0
+                } else {
+                    squared.min(1.0)
+                };
             }
+            cost += errors.iter().sum::<f64>();
             if cost >= limit {
                 return None;
             }

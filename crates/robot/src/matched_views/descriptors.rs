@@ -125,10 +125,14 @@ fn packed(rows: &Array2<f32>) -> Vec<i8> {
 
 /// Compressed descriptors as numbers, shape (n, [`COMPRESSED`]); cosines are their dot products.
 pub(super) fn unpacked(compressed: &[i8]) -> Array2<f32> {
-    let rows = compressed.len() / COMPRESSED;
-    Array2::from_shape_fn((rows, COMPRESSED), |(row, column)| {
-        f32::from(compressed[row * COMPRESSED + column]) / SCALE
-    })
+    let rows = compressed.chunks_exact(COMPRESSED);
+    let mut unpacked = Array2::zeros((rows.len(), COMPRESSED));
+    for (mut to, from) in unpacked.outer_iter_mut().zip(rows) {
+        for (to, &from) in to.iter_mut().zip(from) {
+            *to = f32::from(from) / SCALE;
+        }
+    }
+    unpacked
 }
 
 /// Pairs (row of `a`, row of `b`) that are each other's most similar row and whose cosine is at
@@ -139,25 +143,26 @@ pub(super) fn mutual_matches(
     min_cosine: f32,
 ) -> Vec<(usize, usize)> {
     let similarity = a.dot(&b.t());
-    let mut best_in_b = vec![(0, f32::NEG_INFINITY); a.nrows()];
-    let mut best_in_a = vec![(0, f32::NEG_INFINITY); b.nrows()];
+    // For each row of `b`, its most similar row of `a`. Without branches, the compiler vectorizes this.
+    let mut cosines = vec![f32::NEG_INFINITY; b.nrows()];
+    let mut best_in_a = vec![0_u32; b.nrows()];
     for (row, similar) in similarity.outer_iter().enumerate() {
-        let best = &mut best_in_b[row];
-        for (column, &value) in similar.iter().enumerate() {
-            if value > best.1 {
-                *best = (column, value);
-            }
-            if value > best_in_a[column].1 {
-                best_in_a[column] = (row, value);
-            }
+        let best = cosines.iter_mut().zip(&mut best_in_a);
+        for ((cosine, best), &value) in best.zip(similar) {
+            let is_better = value > *cosine;
+            *best = if is_better { row as u32 } else { *best };
+            *cosine = if is_better { value } else { *cosine };
         }
     }
 
-    best_in_b
-        .iter()
-        .enumerate()
-        .filter(|&(row, &(column, cosine))| cosine >= min_cosine && best_in_a[column].0 == row)
-        .map(|(row, &(column, _))| (row, column))
+    let mutual = similarity.outer_iter().enumerate();
+    mutual
+        .filter_map(|(row, similar)| {
+            let greatest = similar.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+            let column = similar.iter().position(|&value| value == greatest)?;
+            let is_mutual = greatest >= min_cosine && best_in_a[column] as usize == row;
+            is_mutual.then_some((row, column))
+        })
         .collect()
 }
 

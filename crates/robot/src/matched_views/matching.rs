@@ -103,6 +103,28 @@ impl KeypointMap {
         parameters: &MatchingParameters,
     ) -> Option<MatchedView> {
         let query = Query::new(self, view, parameters);
+        self.match_query(&query, candidates, poses, parameters)
+    }
+
+    /// Matches a frame of another map of the same encoder, by its row, with the most similar frames.
+    pub fn match_mapped(
+        &self,
+        (other, row): (&Self, usize),
+        index: &PlaceIndex,
+        poses: &[Pose],
+        parameters: &MatchingParameters,
+    ) -> Option<MatchedView> {
+        let query = Query::of_mapped(self, other, row);
+        self.match_query(&query, Candidates::Similar(index), poses, parameters)
+    }
+
+    fn match_query(
+        &self,
+        query: &Query<'_>,
+        candidates: Candidates<'_>,
+        poses: &[Pose],
+        parameters: &MatchingParameters,
+    ) -> Option<MatchedView> {
         let frames = match candidates {
             Candidates::Similar(index) => {
                 index.nearest(query.descriptors.view(), parameters.more_frames)
@@ -111,14 +133,17 @@ impl KeypointMap {
             Candidates::Listed(rows) => rows.to_vec(),
         };
 
-        let first = parameters.first_frames.min(frames.len());
-        let found = query.matched(&frames[..first], poses, parameters);
+        let (first, others) = frames.split_at(parameters.first_frames.min(frames.len()));
+        let mut matches = FrameMatches::default();
+        query.match_frames(first, poses, parameters, &mut matches);
+        let found = query.posed(&matches, poses, parameters);
         let is_enough = |found: &MatchedView| found.inliers >= parameters.confident_inliers;
-        if found.as_ref().is_some_and(is_enough) || frames.len() == first {
+        if found.as_ref().is_some_and(is_enough) || others.is_empty() {
             return found;
         }
 
-        let wider = query.matched(&frames, poses, parameters);
+        query.match_frames(others, poses, parameters, &mut matches);
+        let wider = query.posed(&matches, poses, parameters);
         let count = |found: &Option<MatchedView>| found.as_ref().map_or(0, |found| found.inliers);
         if count(&wider) > count(&found) {
             wider
@@ -146,6 +171,14 @@ impl KeypointMap {
     }
 }
 
+/// Matches of a view with mapped frames.
+#[derive(Default)]
+struct FrameMatches {
+    correspondences: Vec<Correspondence>,
+    /// Places of the keypoints in their mapped frames.
+    mapped: Vec<usize>,
+}
+
 /// A view, prepared for matching.
 struct Query<'a> {
     map: &'a KeypointMap,
@@ -171,14 +204,31 @@ impl<'a> Query<'a> {
         }
     }
 
-    fn matched(
+    /// A frame of another map. Its keypoints are those with the best scores.
+    fn of_mapped(map: &'a KeypointMap, other: &'a KeypointMap, row: usize) -> Self {
+        let frame = &other.frames[row];
+        let plane = (0..frame.len()).map(|place| {
+            let point = frame.point(place, &other.camera);
+            point.xy() / point.z
+        });
+        let compressed = map.basis.compress_again(&frame.descriptors, &other.basis);
+        Self {
+            map,
+            points: &frame.points,
+            plane: plane.collect(),
+            focal_px: pixel_focal(&other.camera),
+            descriptors: unpacked(&compressed),
+        }
+    }
+
+    /// Adds the matches with some mapped frames.
+    fn match_frames(
         &self,
         frames: &[usize],
         poses: &[Pose],
         parameters: &MatchingParameters,
-    ) -> Option<MatchedView> {
-        let mut correspondences = Vec::new();
-        let mut mapped_places = Vec::new();
+        matches: &mut FrameMatches,
+    ) {
         for &frame in frames {
             let mapped = &self.map.frames[frame];
             let pose = &poses[frame];
@@ -191,7 +241,7 @@ impl<'a> Query<'a> {
 
             for (keypoint, place) in pairs {
                 let from_camera = pose.rotation * in_camera[place];
-                correspondences.push(Correspondence {
+                matches.correspondences.push(Correspondence {
                     keypoint,
                     frame,
                     plane: self.plane[keypoint],
@@ -199,10 +249,22 @@ impl<'a> Query<'a> {
                     from_frame: from_camera,
                     deviation: f64::from(mapped.deviations[place]),
                 });
-                mapped_places.push(place);
+                matches.mapped.push(place);
             }
         }
+    }
 
+    /// The pose that most matches agree with.
+    fn posed(
+        &self,
+        matches: &FrameMatches,
+        poses: &[Pose],
+        parameters: &MatchingParameters,
+    ) -> Option<MatchedView> {
+        let FrameMatches {
+            correspondences,
+            mapped,
+        } = matches;
         let search = Search {
             focal_px: self.focal_px,
             threshold_px: parameters.threshold_px(self.map.epipolar_px),
@@ -211,7 +273,7 @@ impl<'a> Query<'a> {
             miss_probability: parameters.miss_probability,
             seed: SEED,
         };
-        let found = find_pose(&correspondences, &search)?;
+        let found = find_pose(correspondences, &search)?;
 
         let inliers = || found.inliers.iter().map(|&place| &correspondences[place]);
         let unique: BTreeSet<usize> = inliers().map(|match_| match_.keypoint).collect();
@@ -222,7 +284,7 @@ impl<'a> Query<'a> {
             .map(|&place| InlierMatch {
                 keypoint: correspondences[place].keypoint,
                 frame: correspondences[place].frame,
-                mapped: mapped_places[place],
+                mapped: mapped[place],
             })
             .collect();
 
@@ -244,7 +306,7 @@ impl<'a> Query<'a> {
                 gap,
                 unit_m: self.map.unit_m,
             },
-            focal: fitted_focal(&search, &correspondences, &found.pose, found.variance_px),
+            focal: fitted_focal(&search, correspondences, &found.pose, found.variance_px),
             matches,
         })
     }

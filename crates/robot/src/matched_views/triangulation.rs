@@ -26,6 +26,7 @@ pub(super) struct PosedKeypoints<'a> {
     pub keypoints: &'a Keypoints,
     /// Keypoints on the plane at depth 1, undistorted.
     pub plane: Vec<Vector2<f64>>,
+    descriptors: Vec<&'a [i8]>,
 }
 
 impl<'a> PosedKeypoints<'a> {
@@ -40,6 +41,7 @@ impl<'a> PosedKeypoints<'a> {
             pose,
             keypoints,
             plane: plane_points(keypoints, camera, count),
+            descriptors: keypoints.descriptors().take(count).collect(),
         }
     }
 }
@@ -231,14 +233,14 @@ impl<'a> View<'a> {
         let mut best_in_neighbor: Vec<Option<(usize, i32)>> = vec![None; frame.plane.len()];
         let mut best_in_frame: Vec<Option<(usize, i32)>> = vec![None; neighbor.plane.len()];
         let gate = parameters.epipolar_gate_px / focal_px;
+        let mut distances = vec![0.0; neighbor.plane.len()];
         for (place, line) in lines.iter().enumerate() {
-            let descriptor = frame.keypoints.descriptor(place);
-            for (other, point) in neighbor.plane.iter().enumerate() {
-                if (line.x * point.x + line.y * point.y + line.z).abs() >= gate {
-                    continue;
-                }
-
-                let similarity = dot(descriptor, neighbor.keypoints.descriptor(other));
+            for (distance, point) in distances.iter_mut().zip(&neighbor.plane) {
+                *distance = (line.x * point.x + line.y * point.y + line.z).abs();
+            }
+            let descriptor = frame.descriptors[place];
+            for (other, _) in distances.iter().enumerate().filter(|(_, at)| **at < gate) {
+                let similarity = dot(descriptor, neighbor.descriptors[other]);
                 let better =
                     |best: Option<(usize, i32)>| best.is_none_or(|(_, of)| similarity > of);
                 if better(best_in_neighbor[place]) {
@@ -256,8 +258,8 @@ impl<'a> View<'a> {
             .map(|(place, best)| {
                 let (other, similarity) = (*best)?;
                 let is_mutual = best_in_frame[other].is_some_and(|(back, _)| back == place);
-                let a = frame.keypoints.descriptor(place);
-                let b = neighbor.keypoints.descriptor(other);
+                let a = frame.descriptors[place];
+                let b = neighbor.descriptors[other];
                 let lengths = (dot(a, a) as f32 * dot(b, b) as f32).sqrt();
                 let is_similar = similarity as f32 > parameters.min_cosine * lengths;
                 (is_mutual && is_similar).then(|| &neighbor.plane[other])

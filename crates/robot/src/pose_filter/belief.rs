@@ -2,21 +2,24 @@
 
 use nalgebra::{Cholesky, Matrix6, SMatrix, SVector, Vector6};
 
-use super::{FilterParameters, MotionNoise};
+use super::{FilterParameters, MeasuredInertia};
 use crate::tracking::{Drift, MotionPrior, PoseWithCovariance};
 use crate::visual_odometry::VisualMotion;
 use seese3_core::geometry::{Pose, Twist, adjoint, exp, left_jacobian_inverse, log};
 
-const STATE: usize = 24;
-const JOINT: usize = 30;
+pub const STATE: usize = 30;
+const JOINT: usize = 36;
 /// Number of lasting errors of motions.
-const MOTION_ERRORS: usize = 6;
+const MOTION_ERRORS: usize = 12;
 /// Places of the scale of translations of wheel odometry, of its rotations, of its rotations per
-/// meter, and of the scale of visual odometry.
+/// meter, of the scale of visual odometry, and of the biases of gyroscope and accelerometer.
 const WHEEL_SCALE: usize = 0;
 const WHEEL_TURN: usize = 1;
 const WHEEL_CURVE: usize = 2;
 const VISUAL_SCALE: usize = 5;
+const INERTIAL_BIASES: usize = 6;
+/// Rows of the inertial biases in the state.
+pub const BIASES: usize = MOTIONS + INERTIAL_BIASES;
 type StateMatrix = SMatrix<f64, STATE, STATE>;
 type JointMatrix = SMatrix<f64, JOINT, JOINT>;
 type Observed<const N: usize> = SMatrix<f64, N, JOINT>;
@@ -25,8 +28,8 @@ type Observed<const N: usize> = SMatrix<f64, N, JOINT>;
 const UNINFORMATIVE: f64 = 1e4;
 
 /// Rows of the blocks of the state.
-const POSE: usize = 0;
-const VELOCITY: usize = 6;
+pub const POSE: usize = 0;
+pub const VELOCITY: usize = 6;
 const CORRELATED: usize = 12;
 const MOTIONS: usize = 18;
 
@@ -36,6 +39,9 @@ const MOTION: usize = 6;
 const END_VELOCITY: usize = 12;
 const END_CORRELATED: usize = 18;
 const END_MOTIONS: usize = 24;
+
+/// Shortest time of a step, seconds.
+const LEAST_SECONDS: f64 = 1e-3;
 
 /// Pose, velocity, the correlated error of located poses, and the errors of measured motions, with the
 /// covariance of the errors of all four.
@@ -52,7 +58,7 @@ pub struct Belief {
     pub correlated_error: Vector6<f64>,
     /// Errors of wheel odometry, in standard deviations of its drift: scale of the translations, scale
     /// of the rotations, and rotation about each axis per meter. Then the error of the scale of visual
-    /// odometry, in its standard deviations.
+    /// odometry, and the biases of gyroscope and accelerometer, in their standard deviations.
     pub motion_errors: SVector<f64, MOTION_ERRORS>,
     /// Of (pose, velocity, correlated error, motion errors); symmetric and positive definite.
     pub covariance: StateMatrix,
@@ -77,6 +83,18 @@ pub struct Step {
     correlated_error: Vector6<f64>,
     motion_errors: SVector<f64, MOTION_ERRORS>,
     covariance: JointMatrix,
+}
+
+/// The motion and the final velocity that a belief predicts. Their errors are ordered (motion,
+/// velocity), each (v, ω).
+pub struct Predicted {
+    /// `start_from_end`.
+    pub motion: Pose,
+    pub velocity: Vector6<f64>,
+    /// Derivatives of their errors by that of the state.
+    pub transition: SMatrix<f64, 12, STATE>,
+    /// Covariance of their errors for a known state.
+    pub noise: SMatrix<f64, 12, 12>,
 }
 
 /// A linear observation of the error state.
@@ -168,6 +186,11 @@ impl Belief {
         self
     }
 
+    /// Biases of gyroscope and accelerometer, in their standard deviations.
+    pub fn inertial_biases(&self) -> Vector6<f64> {
+        self.motion_errors.fixed_rows::<6>(INERTIAL_BIASES).into()
+    }
+
     /// Covariance of the velocity.
     pub fn velocity_covariance(&self) -> Matrix6<f64> {
         self.covariance
@@ -179,8 +202,15 @@ impl Belief {
     ///
     /// The velocity is the Ornstein–Uhlenbeck process of `prior`. The correlated error decays over the
     /// motion that the velocity predicts, by the correlation range of the parameters.
-    pub fn step(&self, prior: &MotionPrior, seconds: f64, parameters: &FilterParameters) -> Step {
-        self.step_with(prior, seconds, parameters, parameters.process_noise_factor)
+    pub fn step(
+        &self,
+        prior: &MotionPrior,
+        seconds: f64,
+        inertia: Option<&MeasuredInertia>,
+        parameters: &FilterParameters,
+    ) -> Step {
+        let predicted = self.by_prior(prior, seconds, parameters.process_noise_factor);
+        self.step_by(predicted, seconds, inertia, parameters)
     }
 
     /// As [`Belief::step`], but the prior tells nothing about the motion, which sensors measure: its
@@ -189,55 +219,98 @@ impl Belief {
         &self,
         prior: &MotionPrior,
         seconds: f64,
+        inertia: Option<&MeasuredInertia>,
         parameters: &FilterParameters,
     ) -> Step {
-        self.step_with(prior, seconds, parameters, UNINFORMATIVE)
+        let predicted = self.by_prior(prior, seconds, UNINFORMATIVE);
+        self.step_by(predicted, seconds, inertia, parameters)
     }
 
-    fn step_with(
-        &self,
-        prior: &MotionPrior,
-        seconds: f64,
-        parameters: &FilterParameters,
-        noise_factor: f64,
-    ) -> Step {
+    /// The motion by the prior; `noise_factor` is on its process noise.
+    fn by_prior(&self, prior: &MotionPrior, seconds: f64, noise_factor: f64) -> Predicted {
         let drift = prior.over(&self.velocity, seconds);
+        let mut transition = SMatrix::zeros();
+        for axis in 0..6 {
+            let part = axis / 3;
+            transition[(axis, VELOCITY + axis)] = drift.reach_s[part];
+            transition[(6 + axis, VELOCITY + axis)] = drift.left[part];
+        }
+        Predicted {
+            motion: exp(&drift.motion),
+            velocity: drift.velocity.to_vector(),
+            transition,
+            noise: drift.noise * noise_factor,
+        }
+    }
+
+    fn step_by(
+        &self,
+        by_prior: Predicted,
+        seconds: f64,
+        inertia: Option<&MeasuredInertia>,
+        parameters: &FilterParameters,
+    ) -> Step {
+        let predicted = match inertia {
+            Some(measured) => measured.in_place_of(by_prior, self),
+            None => by_prior,
+        };
         let [range_m, range_rad] = parameters.correlation_range;
-        let expected = &drift.motion;
+        let expected = log(&predicted.motion);
         let ranges = expected.linear.norm() / range_m + expected.angular.norm() / range_rad;
         let decay = (-ranges).exp();
 
-        let mut transition = SMatrix::<f64, JOINT, STATE>::zeros();
-        for axis in 0..6 {
-            let part = axis / 3;
-            transition[(START + axis, POSE + axis)] = 1.0;
-            transition[(MOTION + axis, VELOCITY + axis)] = drift.reach_s[part];
-            transition[(END_VELOCITY + axis, VELOCITY + axis)] = drift.left[part];
-            transition[(END_CORRELATED + axis, CORRELATED + axis)] = decay;
-        }
         // The errors of wheels last; the scale of visual odometry changes with the scene.
         let visual_decay = (-seconds / parameters.visual_scale_time_s).exp();
         let mut motion_errors = self.motion_errors;
         motion_errors[VISUAL_SCALE] *= visual_decay;
-        for error in 0..MOTION_ERRORS {
-            let is_visual = error == VISUAL_SCALE;
-            transition[(END_MOTIONS + error, MOTIONS + error)] =
-                if is_visual { visual_decay } else { 1.0 };
-        }
 
-        let mut covariance = transition * self.covariance * transition.transpose();
-        let mut of_drift = covariance.fixed_view_mut::<12, 12>(MOTION, MOTION);
-        of_drift += drift.noise * noise_factor;
+        // Every row but those of the motion is one of the state, times a factor.
+        let poses = (0..6).map(|axis| (START + axis, POSE + axis, 1.0));
+        let correlated = (0..6).map(|axis| (END_CORRELATED + axis, CORRELATED + axis, decay));
+        let errors = (0..MOTION_ERRORS).map(|error| {
+            let factor = if error == VISUAL_SCALE {
+                visual_decay
+            } else {
+                1.0
+            };
+            (END_MOTIONS + error, MOTIONS + error, factor)
+        });
+        let kept: Vec<(usize, usize, f64)> = poses.chain(correlated).chain(errors).collect();
+
+        let of_state = predicted.transition * self.covariance;
+        let of_motion = of_state * predicted.transition.transpose() + predicted.noise;
+        let mut covariance = JointMatrix::zeros();
+        let mut block = covariance.fixed_view_mut::<12, 12>(MOTION, MOTION);
+        block.copy_from(&of_motion);
+        for &(to, from, factor) in &kept {
+            for row in 0..12 {
+                let value = of_state[(row, from)] * factor;
+                covariance[(MOTION + row, to)] = value;
+                covariance[(to, MOTION + row)] = value;
+            }
+            for &(other_to, other_from, other_factor) in &kept {
+                covariance[(to, other_to)] =
+                    self.covariance[(from, other_from)] * factor * other_factor;
+            }
+        }
         for axis in END_CORRELATED..END_MOTIONS {
             covariance[(axis, axis)] += 1.0 - decay * decay;
         }
         let visual_scale = END_MOTIONS + VISUAL_SCALE;
         covariance[(visual_scale, visual_scale)] += 1.0 - visual_decay * visual_decay;
+        if let Some(measured) = inertia {
+            let noise = &measured.motion.noise;
+            for bias in 0..6 {
+                let at = END_MOTIONS + INERTIAL_BIASES + bias;
+                let walk = noise.bias_walk[bias / 3] / noise.bias[bias / 3];
+                covariance[(at, at)] += walk * walk * seconds;
+            }
+        }
 
         Step {
             start: self.pose,
-            motion: exp(&drift.motion),
-            velocity: drift.velocity.to_vector(),
+            motion: predicted.motion,
+            velocity: predicted.velocity,
             correlated_error: self.correlated_error * decay,
             motion_errors,
             covariance,
@@ -270,7 +343,7 @@ impl Step {
     /// The drift is a scale error of translations, a scale error of rotations, and a rotation per meter
     /// forward, as those of a wrong wheel radius, a wrong track width and unequal wheels. The optical
     /// axis points forward.
-    pub fn by_wheels(&self, motion: &Pose, drift: &Drift, noise: &MotionNoise) -> Observation<6> {
+    pub fn by_wheels(&self, motion: &Pose, drift: &Drift, noise: &Matrix6<f64>) -> Observation<6> {
         let Twist { linear, angular } = log(motion);
         let mut errors = SMatrix::<f64, 6, MOTION_ERRORS>::zeros();
         errors
@@ -289,16 +362,26 @@ impl Step {
     pub fn by_images(
         &self,
         visual: &VisualMotion,
+        seconds: f64,
         parameters: &FilterParameters,
     ) -> Observation<6> {
         let mut errors = SMatrix::<f64, 6, MOTION_ERRORS>::zeros();
         errors
             .fixed_view_mut::<3, 1>(0, VISUAL_SCALE)
             .copy_from(&(log(&visual.motion).linear * visual.scale_deviation));
-        let observed = self.by_motion(&visual.motion, &errors, &parameters.visual_noise);
+        let noise = parameters.visual_noise.over(&log(&visual.motion));
+        let observed = self.by_motion(&visual.motion, &errors, &noise);
         let of_matches = visual.pose_covariance * parameters.visual_design_effect;
+        // Wrong depths turn the translation, too, for about as long as they are in view.
+        let steps = (parameters.visual_depth_time_s / seconds.max(LEAST_SECONDS)).max(1.0);
+        let of_depths =
+            (log(&visual.motion).linear.norm() * visual.scale_deviation).powi(2) * steps;
+        let mut of_translation = Matrix6::zeros();
+        of_translation
+            .fixed_view_mut::<3, 3>(0, 0)
+            .fill_diagonal(of_depths);
         Observation {
-            noise: observed.noise + of_matches,
+            noise: observed.noise + of_matches + of_translation,
             ..observed
         }
     }
@@ -308,7 +391,7 @@ impl Step {
         &self,
         motion: &Pose,
         errors: &SMatrix<f64, 6, MOTION_ERRORS>,
-        noise: &MotionNoise,
+        noise: &Matrix6<f64>,
     ) -> Observation<6> {
         let mut derivative = Observed::zeros();
         derivative
@@ -322,7 +405,7 @@ impl Step {
         Observation {
             residual: difference - errors * self.motion_errors,
             derivative,
-            noise: noise.over(&log(motion)),
+            noise: *noise,
         }
     }
 
@@ -366,9 +449,9 @@ impl Step {
         self.motion_errors += change.fixed_rows::<MOTION_ERRORS>(END_MOTIONS);
 
         // Joseph's form: (I − K H) P (I − K H)ᵀ + K R Kᵀ.
-        let rest = JointMatrix::identity() - gain * observed.derivative;
-        self.covariance =
-            rest * self.covariance * rest.transpose() + gain * noise * gain.transpose();
+        let rest = self.covariance - gain * (observed.derivative * self.covariance);
+        let of_state = rest - (rest * observed.derivative.transpose()) * gain.transpose();
+        self.covariance = of_state + gain * noise * gain.transpose();
     }
 
     /// The motion of the step, `start_from_end`. Time-correlated errors of located poses cancel in it.
@@ -382,20 +465,26 @@ impl Step {
 
     /// The state after the step.
     pub fn end(&self) -> Belief {
-        // The final pose error is the initial one in the new body frame, plus the motion's.
-        let mut merged = SMatrix::<f64, STATE, JOINT>::zeros();
-        merged
-            .fixed_view_mut::<6, 6>(POSE, START)
-            .copy_from(&adjoint(&self.motion.inverse()));
-        for axis in 0..6 {
-            merged[(POSE + axis, MOTION + axis)] = 1.0;
-            merged[(VELOCITY + axis, END_VELOCITY + axis)] = 1.0;
-            merged[(CORRELATED + axis, END_CORRELATED + axis)] = 1.0;
-        }
-        for error in 0..MOTION_ERRORS {
-            merged[(MOTIONS + error, END_MOTIONS + error)] = 1.0;
-        }
-        let covariance = merged * self.covariance * merged.transpose();
+        // The final pose error is the initial one in the new body frame, plus the motion's. The other rows
+        // stay as they are.
+        const OTHERS: usize = STATE - VELOCITY;
+        let end_from_start = adjoint(&self.motion.inverse());
+        let joint = &self.covariance;
+        let of_pose = end_from_start * joint.fixed_rows::<6>(START) + joint.fixed_rows::<6>(MOTION);
+        let pose = of_pose.fixed_columns::<6>(START) * end_from_start.transpose()
+            + of_pose.fixed_columns::<6>(MOTION);
+        let cross = of_pose.fixed_columns::<OTHERS>(END_VELOCITY);
+
+        let mut covariance = StateMatrix::zeros();
+        let mut block = covariance.fixed_view_mut::<6, 6>(POSE, POSE);
+        block.copy_from(&pose);
+        let mut block = covariance.fixed_view_mut::<6, OTHERS>(POSE, VELOCITY);
+        block.copy_from(&cross);
+        let mut block = covariance.fixed_view_mut::<OTHERS, 6>(VELOCITY, POSE);
+        block.copy_from(&cross.transpose());
+        let others = joint.fixed_view::<OTHERS, OTHERS>(END_VELOCITY, END_VELOCITY);
+        let mut block = covariance.fixed_view_mut::<OTHERS, OTHERS>(VELOCITY, VELOCITY);
+        block.copy_from(&others);
 
         Belief {
             pose: self.start * self.motion,

@@ -6,6 +6,7 @@
 //! | --- | --- | --- |
 //! | view matched by keypoints, or most similar mapped frames | pose in the room | covariance of the pose; a share of it is correlated over motion |
 //! | visual odometry, wheels | motion since the last frame | scale and drift are part of the state; the rest is independent |
+//! | gyroscope, accelerometer | motion and velocity, instead of the motion prior | biases are part of the state; the rest is independent |
 //! | gravity | tilt | correlated over time |
 //! | client | initial pose | as stated |
 //!
@@ -16,170 +17,37 @@
 //! - `odom_from_camera` composes the motions without the located poses. It is continuous and drifts.
 
 mod belief;
+mod contradiction;
 mod gravity;
+mod inertia;
+mod parameters;
 mod state;
 mod saved;
 mod status;
 
 pub use belief::Belief;
+pub use contradiction::{Contradicted, Disagreements};
 pub use gravity::MeasuredGravity;
+pub use inertia::MeasuredInertia;
+pub use parameters::{FilterParameters, LocatedParameters, MotionNoise, ParameterError};
 pub use saved::SavedState;
 pub use state::{
-    Disagreement, FilterCandidate, FilterState, KeyframeMark, LastView, LocatedPose, OdometryMark,
-    Source, ViewObservation,
+    FilterCandidate, FilterState, KeyframeMark, LastView, LocatedPose, OdometryMark, Source,
+    ViewObservation,
 };
 
-use crate::tracking::{Drift, MotionPrior, PoseWithCovariance, Refusal, Status, Update, extent_m};
+use crate::tracking::{
+    Drift, MeasuredPose, MotionPrior, PoseWithCovariance, Refusal, Status, Update, extent_m,
+};
 use crate::visual_odometry::VisualMotion;
 use belief::{Observation, Step, twist_covariance};
 use gravity::Tilted;
-use nalgebra::{Matrix6, Vector6};
-use seese3_core::geometry::{Pose, Twist, log};
+use nalgebra::Matrix6;
+use seese3_core::geometry::{Pose, log};
 use seese3_core::room::{FrameId, Room};
 
-/// Parameters of a filter.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FilterParameters {
-    /// Poses of views that are matched by keypoints.
-    pub matched: LocatedParameters,
-    /// Poses by the most similar mapped frames.
-    pub retrieved: LocatedParameters,
-    /// Distance, meters, and angle, radians, over which the correlated part of the errors of located
-    /// poses decays by a factor e. It is the error of the map in view: a camera at rest does not
-    /// average it out.
-    pub correlation_range: [f64; 2],
-    /// Factor on the process noise of the motion prior: a person turns and stops more abruptly than
-    /// a Gaussian process.
-    pub process_noise_factor: f64,
-    /// Squared Mahalanobis length of an innovation above which a located pose counts less: its
-    /// covariance is multiplied by the square of length / gate.
-    pub gate: f64,
-    /// Squared Mahalanobis length of an innovation above which a located pose is not used.
-    pub outlier_gate: f64,
-    /// Maximum time between two poses that agree, seconds. After a longer gap, an uncertain belief
-    /// needs `views_to_agree` poses again.
-    pub max_candidate_s: f64,
-    /// Time without a located view and without visual odometry after which a stream is DEGRADED,
-    /// seconds.
-    pub max_unlocated_s: f64,
-    /// Squared Mahalanobis length of a tilt above which gravity counts less.
-    pub gravity_gate: f64,
-    /// Correlation time of the direction of measured gravity, seconds. Its errors come mostly from
-    /// accelerations.
-    pub gravity_correlation_s: f64,
-    /// Largest standard deviations of the position along any direction, meters, and of the rotation
-    /// about any axis, radians, while TRACKING.
-    pub max_deviation: [f64; 2],
-    /// Independent noise of wheel odometry.
-    pub wheel_noise: MotionNoise,
-    /// Independent noise of visual odometry.
-    pub visual_noise: MotionNoise,
-    /// Factor on the stated covariance of visual odometry, which takes its matches as independent.
-    pub visual_design_effect: f64,
-    /// Correlation time of the error of the scale of visual odometry, seconds.
-    pub visual_scale_time_s: f64,
-    /// Time over which the differences of wheel and visual odometry are summed, and for which a stream
-    /// is DEGRADED after they contradicted each other, seconds.
-    pub disagreement_time_s: f64,
-    /// Largest speed of a measured motion, meters and radians per second. A faster one is a restart of
-    /// the sensor.
-    pub max_speed: [f64; 2],
-    /// Number of consecutive identical images after which a stream is DEGRADED.
-    pub max_unchanged_frames: u32,
-    /// Interval of keyframes, in frames; at least 1.
-    pub keyframe_frames: u32,
-    /// Motion since the keyframe that triggers a new one, ‖(v, ω)‖, meters and radians mixed.
-    pub keyframe_displacement: f64,
-    /// Whether located poses are used.
-    pub fuse: bool,
-}
-
-/// Parameters of located poses from one kind of source.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LocatedParameters {
-    /// Share of the variance of a pose that is correlated from view to view, 0 to 1.
-    pub correlated_share: f64,
-    /// Number of consecutive poses that must agree to start the tracking, or to replace a pose that
-    /// they contradict.
-    pub views_to_agree: u32,
-}
-
-impl Default for FilterParameters {
-    fn default() -> Self {
-        Self {
-            matched: LocatedParameters {
-                correlated_share: 0.7,
-                views_to_agree: 2,
-            },
-            retrieved: LocatedParameters {
-                correlated_share: 0.7,
-                views_to_agree: 10,
-            },
-            correlation_range: [0.15, 0.15],
-            process_noise_factor: 4.0,
-            // The 99 % quantile of χ² with six degrees of freedom, and four times that.
-            gate: 16.81,
-            outlier_gate: 67.24,
-            max_candidate_s: 5.0,
-            max_unlocated_s: 0.1,
-            // The 99 % quantile of χ² with two degrees of freedom.
-            gravity_gate: 9.21,
-            gravity_correlation_s: 2.0,
-            // Errors of 0.2 m and 10° are 2.6 standard deviations: rarer than 1 in 100.
-            max_deviation: [0.077, 0.067],
-            wheel_noise: MotionNoise::WHEELS,
-            visual_noise: MotionNoise::IMAGES,
-            visual_design_effect: 10.0,
-            visual_scale_time_s: 10.0,
-            disagreement_time_s: 1.0,
-            max_speed: [10.0, 15.0],
-            max_unchanged_frames: 5,
-            keyframe_frames: 30,
-            keyframe_displacement: f64::INFINITY,
-            fuse: true,
-        }
-    }
-}
-
-/// Independent noise of measured motions: standard deviations per axis. Variances grow in proportion
-/// to the distance and the angle.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct MotionNoise {
-    /// At rest, meters and radians.
-    pub at_rest: [f64; 2],
-    /// Over a distance of 1 m, meters and radians.
-    pub over_meter: [f64; 2],
-    /// Of the rotation, over an angle of 1 rad, radians.
-    pub over_radian: f64,
-}
-
-impl MotionNoise {
-    /// Noise of wheel odometry, besides its drift.
-    pub const WHEELS: Self = Self {
-        at_rest: [5e-4, 5e-4],
-        over_meter: [1e-2, 5e-3],
-        over_radian: 0.0,
-    };
-
-    /// Noise of visual odometry, besides the error of its scale.
-    pub const IMAGES: Self = Self {
-        at_rest: [1e-3, 1e-3],
-        over_meter: [5e-2, 2e-2],
-        over_radian: 5e-2,
-    };
-
-    /// Covariance over a motion, ordered (v, ω).
-    pub fn over(&self, motion: &Twist) -> Matrix6<f64> {
-        let distance_m = motion.linear.norm();
-        let angle_rad = motion.angular.norm();
-        let [rest_m, rest_rad] = self.at_rest.map(|deviation| deviation.powi(2));
-        let [meter_m, meter_rad] = self.over_meter.map(|deviation| deviation.powi(2));
-
-        let v = rest_m + meter_m * distance_m;
-        let w = rest_rad + meter_rad * distance_m + self.over_radian.powi(2) * angle_rad;
-        Matrix6::from_diagonal(&Vector6::new(v, v, v, w, w, w))
-    }
-}
+/// Least variance of the independent noise of wheel odometry, squared meters and radians.
+const LEAST_VARIANCE: f64 = 1e-10;
 
 /// A mapped room, as far as a filter needs it.
 #[derive(Debug, Clone, PartialEq)]
@@ -207,12 +75,41 @@ pub struct PoseFilter {
     parameters: FilterParameters,
 }
 
+/// The motion since the last frame by wheel odometry.
+#[derive(Clone, Copy)]
+struct WheelMotion {
+    /// `last_from_this`.
+    motion: Pose,
+    drift: Drift,
+    /// Covariance of its independent noise, on (v, ω).
+    noise: Matrix6<f64>,
+}
+
+impl WheelMotion {
+    fn of(
+        measured: &MeasuredPose,
+        motion: Pose,
+        seconds: f64,
+        parameters: &FilterParameters,
+    ) -> Self {
+        let noise = measured.velocity_covariance.map_or_else(
+            || parameters.wheel_noise.over(&log(&motion)),
+            |covariance| covariance * seconds.powi(2) + Matrix6::identity() * LEAST_VARIANCE,
+        );
+        Self {
+            motion,
+            drift: measured.drift,
+            noise,
+        }
+    }
+}
+
 /// Measured motions since the last frame.
 #[derive(Default)]
 struct Motions<'a> {
-    /// By wheel odometry, `last_from_this`, with its drift.
-    wheels: Option<(Pose, Drift)>,
+    wheels: Option<WheelMotion>,
     visual: Option<&'a VisualMotion>,
+    inertia: Option<MeasuredInertia>,
     /// Sequence number of the last frame.
     since: Option<u64>,
 }
@@ -242,6 +139,20 @@ impl PoseFilter {
     pub fn new(rooms: Vec<FilterRoom>, parameters: FilterParameters) -> Option<Self> {
         let is_usable = !rooms.is_empty();
         is_usable.then_some(Self { rooms, parameters })
+    }
+
+    /// The filter with other parameters.
+    #[must_use]
+    pub fn with_parameters(&self, parameters: FilterParameters) -> Self {
+        Self {
+            parameters,
+            ..self.clone()
+        }
+    }
+
+    /// The rooms.
+    pub fn rooms(&self) -> &[FilterRoom] {
+        &self.rooms
     }
 
     /// The parameters.
@@ -281,6 +192,46 @@ impl PoseFilter {
         state.seconds_to(time_ns, sequence).map(|_| ())
     }
 
+    /// The motion since the last frame as the sensors of a frame measure it, without its views: that of
+    /// wheel odometry, else the rotation of the gyroscope at the velocity of the stream. `None` without
+    /// either.
+    pub fn sensed_motion(&self, state: &FilterState, frame: &ViewObservation) -> Option<Pose> {
+        let contradicted = state.recently_contradicted(frame.time_ns, &self.parameters);
+        let seconds = state.seconds_to(frame.time_ns, frame.sequence).ok()?;
+        let wheels = state
+            .wheel_motion_to(frame)
+            .filter(|motion| self.parameters.is_possible(motion, seconds));
+        let by_gyroscope = frame.inertia.as_ref().zip(state.belief);
+        let by_gyroscope = by_gyroscope.map(|(inertia, belief)| Pose {
+            rotation: inertia.motion.rotation,
+            translation: (belief.velocity.linear * inertia.motion.seconds).into(),
+        });
+        wheels
+            .filter(|_| !contradicted.wheels)
+            .or(by_gyroscope.filter(|_| !contradicted.inertia))
+    }
+
+    /// The measured motions since the last frame; none for the first one.
+    fn motions<'a>(
+        &self,
+        state: &FilterState,
+        frame: &'a ViewObservation,
+        seconds: f64,
+    ) -> Motions<'a> {
+        let Some(last) = state.last else {
+            return Motions::default();
+        };
+        let wheels = frame.measured.zip(state.wheel_motion_to(frame));
+        Motions {
+            wheels: wheels.map(|(measured, motion)| {
+                WheelMotion::of(&measured, motion, seconds, &self.parameters)
+            }),
+            visual: frame.visual.as_ref(),
+            inertia: frame.inertia.clone(),
+            since: Some(last.sequence),
+        }
+    }
+
     /// Adds a frame to the stream.
     ///
     /// # Errors
@@ -292,8 +243,7 @@ impl PoseFilter {
     ) -> Result<Update, Refusal> {
         let seconds = state.seconds_to(frame.time_ns, frame.sequence)?;
         let is_first = state.last.is_none();
-        let last_sequence = state.last.map(|last| last.sequence);
-        let wheel_motion = frame.measured.zip(state.wheel_motion_to(frame));
+        let motions = self.motions(state, frame, seconds);
         state.advance(frame);
         state.expire_candidate(frame, self.parameters.max_candidate_s);
 
@@ -301,21 +251,17 @@ impl PoseFilter {
         // the measured motions.
         let prior = &self.rooms[state.room.unwrap_or(0)].motion_prior;
         let belief = state.belief.unwrap_or_else(|| Belief::at_origin(prior));
-        let motions = Motions {
-            wheels: wheel_motion.map(|(measured, motion)| (motion, measured.drift)),
-            visual: frame.visual.as_ref().filter(|_| !is_first),
-            since: last_sequence,
-        };
-        let motions = self.consistent(state, motions, seconds, frame.time_ns);
-        let mut step = self.predicted(&belief, prior, seconds, &motions);
-        if let Some((motion, _)) = motions.wheels {
-            state.wheel_motion = state.wheel_motion.and(log(&motion));
+        let motions = motions.consistent(state, seconds, frame.time_ns, &self.parameters);
+        let mut step = self.predicted(&belief, state.is_placed, prior, seconds, &motions);
+        if let Some(wheels) = &motions.wheels {
+            state.wheel_motion = state.wheel_motion.and(log(&wheels.motion));
         }
         // After a frame without a motion, the camera may be anywhere. The first image, or an identical
         // one, has no motion to measure.
         let has_no_motion = is_first || state.unchanged_frames > 0;
-        // Wheels alone carry a pose that is not to be corrected.
-        let is_driven = motions.wheels.is_some() && !self.parameters.fuse;
+        // Wheels alone carry a pose that is not to be corrected, or if they are trusted.
+        let is_driven =
+            motions.wheels.is_some() && (!self.parameters.fuse || self.parameters.trust_wheels);
         state.is_carried &= motions.visual.is_some() || is_driven || has_no_motion;
         if state.is_carried {
             state.sight_ns = Some(frame.time_ns);
@@ -363,6 +309,7 @@ impl PoseFilter {
             velocity: (!is_first).then_some(belief.velocity),
             status,
             reason,
+            contradicted: state.contradicted_sensors(frame.time_ns, &self.parameters, tilted),
             out_of_distribution: frame.novelty,
             room: state.room.filter(|_| !is_somewhere),
             best_match: frame.best_match,
@@ -467,84 +414,44 @@ impl PoseFilter {
         }
     }
 
-    /// The motions, without both if wheel and visual odometry contradict each other: wheels slip, or
-    /// the images are frozen. A motion that is far from the prior, as after a restart of the wheels, is
-    /// left out too.
-    fn consistent<'a>(
-        &self,
-        state: &mut FilterState,
-        motions: Motions<'a>,
-        seconds: f64,
-        time_ns: i64,
-    ) -> Motions<'a> {
-        let parameters = &self.parameters;
-        let is_usual = |motion: &Pose| {
-            let Twist { linear, angular } = log(motion);
-            linear.norm() <= parameters.max_speed[0] * seconds
-                && angular.norm() <= parameters.max_speed[1] * seconds
-        };
-        let wheels = motions.wheels.filter(|(motion, _)| is_usual(motion));
-        let Some(((motion, drift), visual)) = wheels.zip(motions.visual) else {
-            return Motions { wheels, ..motions };
-        };
-
-        let (driven, seen) = (log(&motion), log(&visual.motion));
-        let noise = parameters.wheel_noise.over(&driven) + parameters.visual_noise.over(&seen);
-        let scale = drift.translation_share.hypot(visual.scale_deviation);
-        let lasting_m = scale * driven.linear.norm().max(seen.linear.norm());
-        let lasting_rad = drift.rotation_share * (driven.angular.norm() + driven.linear.norm());
-        let lasting = [
-            lasting_m,
-            lasting_m,
-            lasting_m,
-            lasting_rad,
-            lasting_rad,
-            lasting_rad,
-        ];
-        let variances = noise.diagonal() + Vector6::from(lasting).map(|value| value * value);
-        let difference = driven.to_vector() - seen.to_vector();
-        let kept = (-seconds / parameters.disagreement_time_s).exp();
-        state.disagreement.add(kept, &difference, &variances);
-
-        let is_contradiction = state.disagreement.squared() > parameters.outlier_gate;
-        if is_contradiction {
-            state.contradicted_ns = Some(time_ns);
-            return Motions {
-                since: motions.since,
-                ..Motions::default()
-            };
-        }
-        Motions { wheels, ..motions }
-    }
-
     /// Predicts a belief some seconds later: by the measured motions or, without any, by the motion
-    /// prior. The prior always smooths the velocity.
+    /// prior. The prior smooths the velocity, unless an accelerometer measures how it changes.
+    /// `is_in_map` says whether the belief is in a room: only there the direction of gravity is known.
     fn predicted(
         &self,
         belief: &Belief,
+        is_in_map: bool,
         prior: &MotionPrior,
         seconds: f64,
         motions: &Motions<'_>,
     ) -> Step {
-        let mut by_prior = belief.step(prior, seconds, &self.parameters);
+        let inertia = motions.inertia.clone().map(|inertia| MeasuredInertia {
+            down_in_parent: inertia.down_in_parent.filter(|_| is_in_map),
+            ..inertia
+        });
+        let inertia = inertia.as_ref();
+        let mut by_prior = belief.step(prior, seconds, inertia, &self.parameters);
         if motions.wheels.is_none() && motions.visual.is_none() {
             return by_prior;
         }
 
-        self.add_motions(&mut by_prior, motions);
-        let mut step = belief.measured_step(prior, seconds, &self.parameters);
-        self.add_motions(&mut step, motions);
+        self.add_motions(&mut by_prior, seconds, motions);
+        if inertia.is_some_and(|inertia| inertia.down_in_parent.is_some()) {
+            return by_prior;
+        }
+        let mut step = belief.measured_step(prior, seconds, inertia, &self.parameters);
+        self.add_motions(&mut step, seconds, motions);
         step.take_velocity(&by_prior);
         step
     }
 
-    fn add_motions(&self, step: &mut Step, motions: &Motions<'_>) {
-        if let Some((motion, drift)) = &motions.wheels {
-            let observed = step.by_wheels(motion, drift, &self.parameters.wheel_noise);
+    fn add_motions(&self, step: &mut Step, seconds: f64, motions: &Motions<'_>) {
+        if let Some(wheels) = &motions.wheels {
+            let observed = step.by_wheels(&wheels.motion, &wheels.drift, &wheels.noise);
             step.update(&observed, 1.0);
         }
         if let Some(visual) = motions.visual {
-            let observed = step.by_images(visual, &self.parameters);
+            let observed = step.by_images(visual, seconds, &self.parameters);
             step.update(&observed, 1.0);
         }
     }
@@ -595,7 +502,8 @@ impl PoseFilter {
                 let prior = &self.rooms[located.room].motion_prior;
                 (Belief::at(&located.pose, prior, correlated_share), 1)
             });
-        if agreeing >= needed {
+        let is_driven = parameters.trust_wheels && state.is_placed && motions.wheels.is_some();
+        if agreeing >= needed && !is_driven {
             state.belief = Some(belief.with_sensors_of(state.belief.as_ref()));
             state.room = Some(located.room);
             state.is_placed = true;
@@ -633,7 +541,7 @@ impl PoseFilter {
         let is_last = motions.since == Some(candidate.sequence);
         let none = Motions::default();
         let motions = if is_last { motions } else { &none };
-        let mut step = self.predicted(&candidate.belief, prior, seconds, motions);
+        let mut step = self.predicted(&candidate.belief, true, prior, seconds, motions);
         let observed = self.observed(&step, located, 1.0);
         let agrees = step.squared_innovation(&observed) <= parameters.gate;
         agrees.then(|| {

@@ -3,7 +3,7 @@
 use nalgebra::Matrix6;
 
 use super::state::LastView;
-use super::{Belief, FilterState, PoseFilter};
+use super::{Belief, Contradicted, FilterState, PoseFilter};
 use crate::tracking::PoseWithCovariance;
 use seese3_core::geometry::{Pose, Twist};
 
@@ -26,6 +26,7 @@ pub struct SavedState {
     last: Option<LastView>,
     located_ns: Option<i64>,
     sight_ns: Option<i64>,
+    contradicted: Contradicted,
     contradicted_ns: Option<i64>,
     unchanged_frames: u32,
     is_carried: bool,
@@ -59,6 +60,7 @@ impl FilterState {
             last: self.last,
             located_ns: self.located_ns,
             sight_ns: self.sight_ns,
+            contradicted: self.contradicted,
             contradicted_ns: self.contradicted_ns,
             unchanged_frames: self.unchanged_frames,
             is_carried: self.is_carried,
@@ -87,6 +89,7 @@ impl PoseFilter {
             last: saved.last,
             located_ns: saved.located_ns,
             sight_ns: saved.sight_ns,
+            contradicted: saved.contradicted,
             contradicted_ns: saved.contradicted_ns,
             unchanged_frames: saved.unchanged_frames,
             is_carried: saved.is_carried,

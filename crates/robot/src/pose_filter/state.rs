@@ -1,11 +1,14 @@
 //! Input and state of a filter.
 
-use nalgebra::{Matrix6, Vector6};
+use nalgebra::Matrix6;
 
 use super::belief::origin;
-use super::{Belief, FilterParameters, MeasuredGravity};
+use super::gravity::Tilted;
+use super::{
+    Belief, Contradicted, Disagreements, FilterParameters, MeasuredGravity, MeasuredInertia,
+};
 use crate::tracking::{
-    BestMatch, Candidate, Drift, MeasuredPose, OdometryDelta, PoseWithCovariance, Refusal,
+    BestMatch, Candidate, Drift, MeasuredPose, OdometryDelta, PoseWithCovariance, Refusal, Sensor,
 };
 use crate::visual_odometry::VisualMotion;
 use seese3_core::geometry::{Pose, log};
@@ -36,6 +39,8 @@ pub struct ViewObservation {
     pub measured: Option<MeasuredPose>,
     /// The direction of gravity, if it is measured.
     pub gravity: Option<MeasuredGravity>,
+    /// The motion since the last frame by gyroscope and accelerometer, if they are measured.
+    pub inertia: Option<MeasuredInertia>,
 }
 
 impl ViewObservation {
@@ -52,6 +57,7 @@ impl ViewObservation {
             visual: None,
             measured: None,
             gravity: None,
+            inertia: None,
         }
     }
 }
@@ -108,41 +114,16 @@ pub struct FilterState {
     pub sight_ns: Option<i64>,
     /// Whether visual odometry has tracked every frame since the last located one.
     pub is_carried: bool,
-    /// The difference of wheel and visual odometry.
-    pub disagreement: Disagreement,
-    /// Time of the last frame at which they contradicted each other, nanoseconds on the sensor's clock.
+    /// The differences between the sensors of motions.
+    pub disagreements: Disagreements,
+    /// The sensors that contradicted others at `contradicted_ns`.
+    pub contradicted: Contradicted,
+    /// Time of the last frame with a contradiction, nanoseconds on the sensor's clock.
     pub contradicted_ns: Option<i64>,
     /// Number of consecutive frames with the same image as the one before.
     pub unchanged_frames: u32,
     /// Time of the last measured gravity, nanoseconds on the sensor's clock.
     pub gravity_ns: Option<i64>,
-}
-
-/// Sum of the differences of wheel and visual odometry; older ones count less.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Disagreement {
-    /// Sum of the twists, meters and radians.
-    pub sum: Vector6<f64>,
-    /// Variances of the sum, if both are right.
-    pub variances: Vector6<f64>,
-}
-
-impl Disagreement {
-    /// Adds the difference of one step, after forgetting a share of the earlier ones.
-    pub(super) fn add(&mut self, kept: f64, difference: &Vector6<f64>, variances: &Vector6<f64>) {
-        self.sum = self.sum * kept + difference;
-        self.variances = self.variances * kept * kept + variances;
-    }
-
-    /// Squared length of the sum in standard deviations: χ² with six degrees of freedom if both
-    /// sensors are right.
-    pub(super) fn squared(&self) -> f64 {
-        let pairs = self.sum.iter().zip(&self.variances);
-        pairs
-            .filter(|(_, variance)| **variance > 0.0)
-            .map(|(sum, variance)| sum * sum / variance)
-            .sum()
-    }
 }
 
 /// The last frame of a stream.
@@ -212,7 +193,8 @@ impl FilterState {
             located_ns: None,
             sight_ns: None,
             is_carried: false,
-            disagreement: Disagreement::default(),
+            disagreements: Disagreements::default(),
+            contradicted: Contradicted::default(),
             contradicted_ns: None,
             unchanged_frames: 0,
             gravity_ns: None,
@@ -278,6 +260,37 @@ impl FilterState {
             covariance: self.odom.covariance + drift,
             ..self.odom
         }
+    }
+
+    /// The sensors that contradicted others a moment ago.
+    pub(super) fn recently_contradicted(
+        &self,
+        time_ns: i64,
+        parameters: &FilterParameters,
+    ) -> Contradicted {
+        let seconds = |since: i64| time_ns.abs_diff(since) as f64 * 1e-9;
+        let is_recent = self
+            .contradicted_ns
+            .is_some_and(|since| seconds(since) < parameters.disagreement_time_s);
+        if is_recent {
+            self.contradicted
+        } else {
+            Contradicted::default()
+        }
+    }
+
+    /// All sensors that contradict others or the pose.
+    pub(super) fn contradicted_sensors(
+        &self,
+        time_ns: i64,
+        parameters: &FilterParameters,
+        tilted: Option<Tilted>,
+    ) -> Vec<Sensor> {
+        let of_motions = self.recently_contradicted(time_ns, parameters).sensors();
+        let gravity = tilted.map(|_| Sensor::Gravity);
+        let is_disputed = self.is_placed && self.candidate.is_some();
+        let views = is_disputed.then_some(Sensor::Views);
+        of_motions.chain(gravity).chain(views).collect()
     }
 
     /// Notes that a view was located.

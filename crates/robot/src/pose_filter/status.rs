@@ -81,13 +81,16 @@ impl PoseFilter {
             return Some(why_unlocated(state, frame));
         }
         let since_s = |earlier: i64| frame.time_ns.abs_diff(earlier) as f64 * 1e-9;
-        let contradicted_s = state.contradicted_ns.map(since_s);
-        if contradicted_s.is_some_and(|seconds| seconds < parameters.disagreement_time_s) {
-            return Some(
-                "wheel odometry and the images contradict each other: wheels slip, or the camera is \
-                 frozen"
-                    .to_owned(),
-            );
+        let contradicted = state.recently_contradicted(frame.time_ns, parameters);
+        // Without the wheels, or the inertial sensor, images carry the pose.
+        if contradicted.images && !parameters.trust_wheels {
+            let reason = if contradicted.wheels {
+                "wheel odometry and the images contradict each other: wheels slip, or the camera is frozen"
+            } else {
+                "the images contradict the other sensors of motion: the camera is frozen, or shows something \
+                 that moves"
+            };
+            return Some(reason.to_owned());
         }
         if let Some(candidate) = &state.candidate {
             let agreement = agreement(candidate);

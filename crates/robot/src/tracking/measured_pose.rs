@@ -17,6 +17,9 @@ pub struct MeasuredPose {
     pub pose: Pose,
     /// Drift rate of the sensor.
     pub drift: Drift,
+    /// Covariance of the independent error of the velocity over the time since the last frame, on
+    /// (v, ω) in the camera's body frame, m²/s² and rad²/s², if the sensor states one.
+    pub velocity_covariance: Option<Matrix6<f64>>,
 }
 
 /// Drift rate of odometry, as standard deviations per axis. Errors are modeled as fully correlated,

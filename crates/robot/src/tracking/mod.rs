@@ -25,7 +25,7 @@ pub use motion_prior::MotionPrior;
 pub(crate) use pose_with_covariance::PLACE_DEVIATION_M;
 pub use pose_with_covariance::PoseWithCovariance;
 pub use relocalize::{ROOM_RATIO, Relocalization, RoomMatch, relocalize};
-pub use update::{BestMatch, Candidate, Refusal, Status, Update};
+pub use update::{BestMatch, Candidate, Refusal, Sensor, Status, Update};
 pub use view::{View, motion};
 
 use seese3_core::room::RoomId;

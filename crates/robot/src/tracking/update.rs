@@ -19,6 +19,21 @@ pub enum Status {
     Relocalizing,
 }
 
+/// A source of observations.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Sensor {
+    /// Wheel odometry, or that of another sensor of the robot.
+    Wheels,
+    /// Visual odometry.
+    Images,
+    /// Gyroscope and accelerometer.
+    Inertia,
+    /// The direction of gravity.
+    Gravity,
+    /// Located views.
+    Views,
+}
+
 /// The most similar mapped frame of a view.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BestMatch {
@@ -70,6 +85,8 @@ pub struct Update {
     pub status: Status,
     /// Reason of the status, as text.
     pub reason: String,
+    /// Sensors that contradict others, or the pose.
+    pub contradicted: Vec<Sensor>,
     /// How unlike the view is to the map, relative to the limit: above 1 it looks like another
     /// place.
     pub out_of_distribution: f64,

@@ -70,6 +70,42 @@ pub(super) struct Bundle {
     pub deviation_px: f64,
 }
 
+/// `camera_from_anchor` of the observations of a bundle.
+struct Relative {
+    count: usize,
+    poses: Vec<Option<(Matrix3<f64>, Vector3<f64>)>>,
+}
+
+impl Relative {
+    fn of(bundle: &Bundle) -> Self {
+        let count = bundle.poses.len();
+        let mut poses = vec![None; count * count];
+        for landmark in &bundle.landmarks {
+            for (camera, _) in &landmark.observations {
+                poses[camera * count + landmark.anchor].get_or_insert_with(|| {
+                    let camera_from_anchor =
+                        bundle.poses[*camera].inv_mul(&bundle.poses[landmark.anchor]);
+                    let rotation = camera_from_anchor.rotation.to_rotation_matrix();
+                    (rotation.into_inner(), camera_from_anchor.translation.vector)
+                });
+            }
+        }
+        Self { count, poses }
+    }
+
+    fn get(&self, camera: usize, anchor: usize) -> (Matrix3<f64>, Vector3<f64>) {
+        self.poses[camera * self.count + anchor]
+            .unwrap_or_else(|| (Matrix3::identity(), Vector3::zeros()))
+    }
+
+    /// The landmark from a camera, in units of its depth in the anchor; `None` behind the camera.
+    fn seen(&self, landmark: &BundleLandmark, camera: usize) -> Option<Vector3<f64>> {
+        let (rotation, shift) = self.get(camera, landmark.anchor);
+        let seen = rotation * landmark.direction + shift * landmark.inverse_depth;
+        (seen.z > MIN_DEPTH).then_some(seen)
+    }
+}
+
 /// A reprojection error, pixels, with the derivatives of the projection.
 struct Row {
     residual: Vector2<f64>,
@@ -153,32 +189,33 @@ impl Bundle {
 
     /// Reprojection error of an observation, pixels; infinite behind the camera.
     pub fn error_px(&self, landmark: &BundleLandmark, camera: usize, point: &Vector2<f64>) -> f64 {
-        match self.seen(landmark, camera) {
+        let camera_from_anchor = self.poses[camera].inv_mul(&self.poses[landmark.anchor]);
+        let seen = camera_from_anchor.rotation * landmark.direction
+            + camera_from_anchor.translation.vector * landmark.inverse_depth;
+        self.error_of(Some(seen).filter(|seen| seen.z > MIN_DEPTH), point)
+    }
+
+    fn error_of(&self, seen: Option<Vector3<f64>>, point: &Vector2<f64>) -> f64 {
+        match seen {
             Some(seen) => (seen.xy() / seen.z - point).norm() * self.focal_px,
             None => f64::INFINITY,
         }
     }
 
-    /// The landmark from a camera, in units of its depth in the anchor; `None` behind the camera.
-    fn seen(&self, landmark: &BundleLandmark, camera: usize) -> Option<Vector3<f64>> {
-        let camera_from_anchor = self.poses[camera].inv_mul(&self.poses[landmark.anchor]);
-        let seen = camera_from_anchor.rotation * landmark.direction
-            + camera_from_anchor.translation.vector * landmark.inverse_depth;
-        (seen.z > MIN_DEPTH).then_some(seen)
-    }
-
     /// Twice the negative logarithm of the posterior density, up to a constant.
     fn cost(&self) -> f64 {
+        let relative = Relative::of(self);
         let mut cost = 0.0;
         for landmark in &self.landmarks {
             let [mean, deviation] = landmark.prior;
             cost += ((landmark.inverse_depth - mean) / deviation).powi(2);
             if self.objective == Objective::Marginal {
-                cost += (self.depth_curvature(landmark) * deviation * deviation).ln();
+                cost += (self.depth_curvature(landmark, &relative) * deviation * deviation).ln();
             }
 
             for (camera, point) in &landmark.observations {
-                let error = self.error_px(landmark, *camera, point) / self.deviation_px;
+                let seen = relative.seen(landmark, *camera);
+                let error = self.error_of(seen, point) / self.deviation_px;
                 let squared = (error * error).min(BEHIND);
                 cost += (DEGREES_OF_FREEDOM + 2.0) * (squared / DEGREES_OF_FREEDOM).ln_1p();
             }
@@ -187,13 +224,12 @@ impl Bundle {
     }
 
     /// Information about ρ for known poses, with full weights.
-    fn depth_curvature(&self, landmark: &BundleLandmark) -> f64 {
+    fn depth_curvature(&self, landmark: &BundleLandmark, relative: &Relative) -> f64 {
         let of_observation = |&(camera, _): &(usize, Vector2<f64>)| {
-            let Some(seen) = self.seen(landmark, camera) else {
+            let Some(seen) = relative.seen(landmark, camera) else {
                 return 0.0;
             };
-            let camera_from_anchor = self.poses[camera].inv_mul(&self.poses[landmark.anchor]);
-            let shift = camera_from_anchor.translation.vector;
+            let (_, shift) = relative.get(camera, landmark.anchor);
             let slope = (shift.xy() - seen.xy() / seen.z * shift.z) / seen.z;
             slope.norm_squared() * (self.focal_px / self.deviation_px).powi(2)
         };
@@ -201,13 +237,15 @@ impl Bundle {
         landmark.prior[1].powi(-2) + observations.sum::<f64>()
     }
 
-    fn row(&self, landmark: &BundleLandmark, camera: usize, point: &Vector2<f64>) -> Option<Row> {
-        let seen = self.seen(landmark, camera)?;
-        let camera_from_anchor = self.poses[camera].inv_mul(&self.poses[landmark.anchor]);
-        let rotation: Matrix3<f64> = camera_from_anchor
-            .rotation
-            .to_rotation_matrix()
-            .into_inner();
+    fn row(
+        &self,
+        landmark: &BundleLandmark,
+        relative: &Relative,
+        camera: usize,
+        point: &Vector2<f64>,
+    ) -> Option<Row> {
+        let seen = relative.seen(landmark, camera)?;
+        let (rotation, shift) = relative.get(camera, landmark.anchor);
 
         let projected = seen.xy() / seen.z;
         let by_seen = Matrix2x3::new(1.0, 0.0, -projected.x, 0.0, 1.0, -projected.y)
@@ -229,7 +267,7 @@ impl Bundle {
                 by_seen * seen.cross_matrix(),
             ),
             by_anchor: rows(of_anchor * landmark.inverse_depth, turned_anchor),
-            by_depth: by_seen * camera_from_anchor.translation.vector,
+            by_depth: by_seen * shift,
             slope_by_camera: rows(of_camera, Matrix2x3::zeros()),
             slope_by_anchor: rows(of_anchor, Matrix2x3::zeros()),
         })
@@ -250,8 +288,9 @@ impl Bundle {
             gradient: DVector::zeros(6 * count),
             depths: Vec::with_capacity(self.landmarks.len()),
         };
+        let relative = Relative::of(self);
         for landmark in &self.landmarks {
-            let depth = self.add_landmark(landmark, &columns, &mut normal);
+            let depth = self.add_landmark(landmark, &relative, &columns, &mut normal);
             normal.eliminate(&depth);
             normal.depths.push(depth);
         }
@@ -262,6 +301,7 @@ impl Bundle {
     fn add_landmark(
         &self,
         landmark: &BundleLandmark,
+        relative: &Relative,
         columns: &[Option<usize>],
         normal: &mut Normal,
     ) -> EliminatedDepth {
@@ -274,9 +314,9 @@ impl Bundle {
         };
 
         let variance = self.deviation_px.powi(2);
-        let curvature = self.depth_curvature(landmark);
+        let curvature = self.depth_curvature(landmark, relative);
         for (camera, point) in &landmark.observations {
-            let Some(row) = self.row(landmark, *camera, point) else {
+            let Some(row) = self.row(landmark, relative, *camera, point) else {
                 continue;
             };
             let squared = row.residual.norm_squared() / variance;
@@ -452,9 +492,10 @@ mod tests {
         let scene = scene(ARC, 0.0);
         let landmark = &scene.landmarks[7];
         let (camera, point) = landmark.observations[2];
-        let row = scene.row(landmark, camera, &point).unwrap();
+        let relative = Relative::of(&scene);
+        let row = scene.row(landmark, &relative, camera, &point).unwrap();
         let projection = |scene: &Bundle, landmark: &BundleLandmark| {
-            let seen = scene.seen(landmark, camera).unwrap();
+            let seen = Relative::of(scene).seen(landmark, camera).unwrap();
             seen.xy() / seen.z * FOCAL_PX
         };
 

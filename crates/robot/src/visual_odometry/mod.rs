@@ -377,6 +377,9 @@ impl VisualOdometry {
         let radius = self.parameters.search_radius_px / frame.focal_px;
         let mut best_keypoint: Vec<Option<(usize, f32)>> = vec![None; candidates.len()];
         let mut best_candidate: Vec<Option<(usize, f32)>> = vec![None; frame.plane.len()];
+        let descriptors: Vec<&[i8]> = frame.keypoints.descriptors().collect();
+        let cells = Cells::of(&frame.plane, radius);
+        let all: Vec<usize> = (0..frame.plane.len()).collect();
         for (place, candidate) in candidates.iter().enumerate() {
             let position = self.map.position(candidate.anchor);
             let keyframe = self.map.keyframe(candidate.keypoint.0);
@@ -386,17 +389,15 @@ impl VisualOdometry {
 
             let seen = predicted.inverse_transform_point(&position).coords;
             let expected = seen.xy() / seen.z;
-            let is_near = |point: &Vector2<f64>| match reach {
-                Reach::Near => seen.z > 0.0 && (point - expected).norm() < radius,
-                Reach::Wide => true,
+            let near: Vec<usize> = match reach {
+                Reach::Near if seen.z > 0.0 => cells.within(&frame.plane, &expected, radius),
+                Reach::Near => Vec::new(),
+                Reach::Wide => all.clone(),
             };
             let descriptor = keyframe.keypoints.descriptor(candidate.keypoint.1);
             let length = length(descriptor);
-            for (keypoint, point) in frame.plane.iter().enumerate() {
-                if !is_near(point) {
-                    continue;
-                }
-                let product = dot(descriptor, frame.keypoints.descriptor(keypoint)) as f32;
+            for keypoint in near {
+                let product = dot(descriptor, descriptors[keypoint]) as f32;
                 let cosine = product / (length * frame.lengths[keypoint]);
                 let is_better = |best: Option<(usize, f32)>| best.is_none_or(|(_, of)| cosine > of);
                 if is_better(best_keypoint[place]) {
@@ -486,11 +487,69 @@ impl VisualOdometry {
     }
 }
 
+/// Points by the square cell that they lie in.
+struct Cells {
+    size: f64,
+    /// The least coordinates of the points.
+    origin: Vector2<f64>,
+    columns: usize,
+    /// Row by row.
+    points: Vec<Vec<usize>>,
+}
+
+/// Maximum number of cells along each axis.
+const MOST_CELLS: usize = 64;
+
+impl Cells {
+    /// Cells that are at least this large.
+    fn of(points: &[Vector2<f64>], least_size: f64) -> Self {
+        let bound = |of: fn(f64, f64) -> f64, from: f64| {
+            let corner = Vector2::repeat(from);
+            let points = points.iter();
+            points.fold(corner, |corner, point| corner.zip_map(point, of))
+        };
+        let origin = bound(f64::min, f64::INFINITY);
+        let extent = bound(f64::max, f64::NEG_INFINITY) - origin;
+        let size = least_size.max(extent.max() / MOST_CELLS as f64);
+        let count = |axis: usize| (extent[axis].max(0.0) / size) as usize + 1;
+        let mut cells = Self {
+            size,
+            origin,
+            columns: count(0),
+            points: vec![Vec::new(); count(0) * count(1)],
+        };
+        for (place, point) in points.iter().enumerate() {
+            let [x, y] = [0, 1].map(|axis| ((point[axis] - origin[axis]) / size) as usize);
+            cells.points[y * cells.columns + x].push(place);
+        }
+        cells
+    }
+
+    /// Places of the points less than `radius` from a center; it is at most the size of a cell.
+    fn within(&self, points: &[Vector2<f64>], center: &Vector2<f64>, radius: f64) -> Vec<usize> {
+        let rows = self.points.len() / self.columns;
+        let around = |axis: usize, count: usize| {
+            let cell = (center[axis] - self.origin[axis]) / self.size;
+            let bound = |cell: f64| cell.clamp(0.0, count as f64) as usize;
+            bound(cell.floor() - 1.0)..bound(cell.floor() + 2.0)
+        };
+        let is_near = |place: &usize| (points[*place] - center).norm() < radius;
+        let mut near = Vec::new();
+        for row in around(1, rows) {
+            for column in around(0, self.columns) {
+                let places = &self.points[row * self.columns + column];
+                near.extend(places.iter().copied().filter(is_near));
+            }
+        }
+        near
+    }
+}
+
 impl<'a> Frame<'a> {
     fn new(view: ViewKeypoints<'a>, candidates: usize) -> Self {
         let keypoints = view.keypoints;
         let plane = plane_points(keypoints, view.camera, candidates);
-        let lengths = (0..plane.len()).map(|place| length(keypoints.descriptor(place)));
+        let lengths = keypoints.descriptors().take(plane.len()).map(length);
         Self {
             keypoints,
             lengths: lengths.collect(),

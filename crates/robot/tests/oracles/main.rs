@@ -8,6 +8,7 @@
 )]
 
 mod fitting;
+mod inertial;
 mod localization;
 mod matched_views;
 mod multi_step;

@@ -816,3 +816,46 @@ fn errors_of_stated_poses_are_part_of_the_covariance() {
         );
     }
 }
+
+/// Oracle: the similarity between the two world frames. The second map shows the same scene from other
+/// cameras, in another world frame and scale. A map of another scene is refused.
+#[test]
+fn two_maps_of_one_scene_are_aligned() {
+    let scene = Scene::in_box(POINTS, 1);
+    let first = World::new(scene.clone(), camera_path(FRAMES), 0.3);
+    let second = World::new(scene, new_poses(FRAMES), 0.3);
+    let map_from_other = Pose::new(Vector3::new(3.0, -1.0, 0.5), Vector3::new(0.2, 0.9, -0.4));
+    let scale = 1.25;
+    let stated: Vec<Pose> = second
+        .poses
+        .iter()
+        .map(|pose| {
+            let mut moved = map_from_other.inv_mul(pose);
+            moved.translation.vector /= scale;
+            moved
+        })
+        .collect();
+    let other = second.map(&stated, second.camera);
+    let room = first.room();
+
+    let found = room.align(&other, &stated, true).unwrap();
+    let similarity = found.map_from_other;
+    near("scale", similarity.scale, scale, 0.01 * scale);
+    let off = similarity.reference_from_estimate.inv_mul(&Pose {
+        // With a scale, the translation is that of the scaled coordinates.
+        translation: (map_from_other.translation.vector).into(),
+        rotation: map_from_other.rotation,
+    });
+    assert!(off.rotation.angle() < 0.01, "{off}");
+    for (stated, truth) in stated.iter().zip(&second.poses) {
+        let moved = similarity.pose(stated).inv_mul(truth);
+        assert!(moved.translation.vector.norm() < 0.02, "{moved}");
+    }
+    let [tried, located, agreeing] = found.counts;
+    assert!(agreeing <= located && located <= tried && agreeing * 2 > tried);
+
+    let elsewhere = World::new(Scene::in_box(POINTS, 9), camera_path(FRAMES), 0.3);
+    let map = elsewhere.map(&elsewhere.poses, elsewhere.camera);
+    let refused = room.align(&map, &elsewhere.poses, false).unwrap_err();
+    assert!(refused.agreeing < 5 && refused.to_string().contains("at least 5"));
+}

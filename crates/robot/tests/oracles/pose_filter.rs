@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix6, Unit, Vector3, Vector6};
 
-use seese3_core::geometry::{Pose, PoseError, Twist, body_twist, exp};
+use seese3_core::geometry::{Pose, PoseError, Twist, body_twist, exp, log};
 use seese3_robot::pose_filter::{
     Belief, FilterParameters, FilterRoom, FilterState, LocatedPose, MeasuredGravity, MotionNoise,
     PoseFilter, Source, ViewObservation,
@@ -90,7 +90,7 @@ fn correlated_errors_are_not_averaged_out() {
     let pose = located(Pose::identity(), 0.01);
     let variance_after_two = |share: f64| {
         let parameters = parameters(1e9);
-        let mut step = Belief::at(&pose, &prior, share).step(&prior, 0.0, &parameters);
+        let mut step = Belief::at(&pose, &prior, share).step(&prior, 0.0, None, &parameters);
         step.update(&step.located(&pose, share), 1.0);
         step.end().place().covariance[(0, 0)]
     };
@@ -112,7 +112,7 @@ fn correlated_errors_decay_over_the_distance() {
         belief.correlated_error = Vector6::repeat(1.0);
         belief.velocity.linear.x = speed;
         belief
-            .step(&prior, 0.001, &parameters)
+            .step(&prior, 0.001, None, &parameters)
             .end()
             .correlated_error[0]
     };
@@ -137,7 +137,7 @@ fn correlated_errors_cancel_in_a_motion() {
     let (start, end) = (Pose::identity(), Pose::translation(0.0, 0.0, 0.05));
 
     let belief = Belief::at(&located(start * error, 0.02), &prior, share);
-    let mut step = belief.step(&prior, 0.1, &parameters);
+    let mut step = belief.step(&prior, 0.1, None, &parameters);
     step.update(&step.located(&located(end * error, 0.02), share), 1.0);
     let motion = step.motion();
     assert!(PoseError::between(&motion.pose, &end).translation_m < 1e-5);
@@ -163,8 +163,11 @@ fn errors_turn_with_the_camera() {
         translation_share: 1e-4,
         rotation_share: 1e-4,
     };
-    let mut step = Belief::at(&place, &prior, 0.0).step(&prior, 0.1, &parameters);
-    step.update(&step.by_wheels(&turn, &drift, &MotionNoise::WHEELS), 1.0);
+    let mut step = Belief::at(&place, &prior, 0.0).step(&prior, 0.1, None, &parameters);
+    step.update(
+        &step.by_wheels(&turn, &drift, &MotionNoise::WHEELS.over(&log(&turn))),
+        1.0,
+    );
     let end = step.end().place();
     assert!((end.covariance[(1, 1)] - 1e-2).abs() < 1e-4, "{end:?}");
     assert!(end.covariance[(0, 0)] < 1e-4);
@@ -207,6 +210,7 @@ fn wheels_carry_the_pose_and_their_errors_are_learned() {
         let row = number as usize;
         let measured = MeasuredPose {
             pose: start * wheels[row],
+            velocity_covariance: None,
             drift,
         };
         ViewObservation {
@@ -377,6 +381,7 @@ fn wheels_reveal_frozen_images() {
                 visual: Some(if seen == number { moved } else { still }),
                 measured: Some(MeasuredPose {
                     pose: path(number),
+                    velocity_covariance: None,
                     drift,
                 }),
                 ..view(number, Some(path(seen)))
@@ -406,6 +411,7 @@ fn restarted_wheels_do_not_move_the_pose() {
         let observed = ViewObservation {
             measured: Some(MeasuredPose {
                 pose: Pose::translation(frame, 0.0, 0.0) * path(number),
+                velocity_covariance: None,
                 drift,
             }),
             ..view(number, (number <= 30).then(|| path(number)))

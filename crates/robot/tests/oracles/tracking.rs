@@ -525,6 +525,7 @@ fn wheels_carry_a_blind_camera() {
                 is_blank: is_blind,
                 measured: has_wheels.then_some(MeasuredPose {
                     pose: wheels,
+                    velocity_covariance: None,
                     drift: Drift {
                         translation_share: 0.05,
                         rotation_share: 0.05,

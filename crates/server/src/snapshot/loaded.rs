@@ -12,6 +12,7 @@ use seese3_core::navigation::Navigator;
 use seese3_core::room::Room;
 use seese3_robot::fitting::RoomReader;
 use seese3_robot::localization::KeypointRoom;
+use seese3_robot::pose_filter::FilterParameters;
 use seese3_robot::tracking::Map;
 use seese3_store::StoredAdapter;
 
@@ -32,6 +33,8 @@ pub struct LoadedRoom {
     pub navigators: Vec<Arc<ServedNavigator>>,
     /// The keypoints of the room, if it has any.
     pub keypoints: Option<ServedKeypoints>,
+    /// Parameters of filters that were fitted to the room.
+    pub tracking: Option<FilterParameters>,
     /// Adapters with matching features that cannot serve the room, by name.
     pub refused: BTreeMap<String, Refusal>,
 }
@@ -64,6 +67,8 @@ pub struct ServedNavigator {
     pub reader: Option<Arc<RoomReader>>,
     /// The keypoints of the room and their source, if it has any.
     pub keypoints: Option<ServedKeypoints>,
+    /// Parameters of filters that were fitted to the room.
+    pub tracking: Option<FilterParameters>,
     /// The reader of the most preferred fitted adapter, with which the map locates views.
     pub(super) tracking_reader: Option<Arc<RoomReader>>,
 }

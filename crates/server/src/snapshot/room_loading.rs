@@ -161,6 +161,7 @@ impl RoomLoader {
             room: frames,
             navigators,
             keypoints,
+            tracking: stored.tracking,
             refused,
         })
     }
@@ -248,6 +249,7 @@ impl RoomLoader {
             trained_on,
             reader,
             keypoints: keypoints.cloned(),
+            tracking: stored.tracking,
             tracking_reader,
             room_revision: stored.revision,
             adapter: adapter.clone(),

@@ -2,12 +2,14 @@
 
 use std::sync::Arc;
 
+use nalgebra::Matrix6;
+
 use super::super::Error;
 use super::super::convert;
 use super::super::relocalization::rooms_to_track_in;
 use super::super::snapshot::{ServedNavigator, Snapshot};
 use seese3_client::proto::v1 as pb;
-use seese3_core::geometry::Pose;
+use seese3_core::geometry::{Pose, adjoint};
 use seese3_robot::pose_filter::FilterParameters;
 use seese3_robot::tracking::{Drift, MeasuredPose, PoseWithCovariance};
 
@@ -15,6 +17,8 @@ use seese3_robot::tracking::{Drift, MeasuredPose, PoseWithCovariance};
 const KNOWN: f64 = 0.1;
 /// Valid standard deviations of a given pose, meters or radians.
 const DEVIATIONS: std::ops::RangeInclusive<f64> = 1e-6..=1e3;
+/// Largest asymmetry and negative eigenvalue of a covariance, relative to its largest entry.
+const ASYMMETRY: f64 = 1e-6;
 /// Default names of the map, odometry, camera and base frames.
 const FRAME_NAMES: [&str; 4] = ["map", "odom", "camera", "base_link"];
 /// Maximum length of a frame name, bytes.
@@ -90,7 +94,10 @@ pub fn is_fused(fusion: i32) -> Result<bool, Error> {
 ///
 /// # Errors
 /// [`Error::Invalid`] on a field that is not valid.
-pub fn parameters(config: &pb::TrackConfig) -> Result<FilterParameters, Error> {
+pub fn parameters(
+    config: &pb::TrackConfig,
+    fitted: FilterParameters,
+) -> Result<FilterParameters, Error> {
     let pb::KeyframePolicy {
         displacement,
         frames,
@@ -105,12 +112,12 @@ pub fn parameters(config: &pb::TrackConfig) -> Result<FilterParameters, Error> {
         return Err(Error::invalid("keyframes.frames", "must be at least 1"));
     }
 
-    let default = FilterParameters::default();
     Ok(FilterParameters {
-        keyframe_frames: frames.unwrap_or(default.keyframe_frames),
-        keyframe_displacement: displacement.unwrap_or(default.keyframe_displacement),
+        keyframe_frames: frames.unwrap_or(fitted.keyframe_frames),
+        keyframe_displacement: displacement.unwrap_or(fitted.keyframe_displacement),
         fuse: is_fused(config.fusion)?,
-        ..default
+        trust_wheels: config.trust_odometry,
+        ..fitted
     })
 }
 
@@ -236,6 +243,7 @@ impl StreamFrames {
             pose,
             translation_share,
             rotation_share,
+            velocity_covariance,
         } = given;
         let mut pose = pose.ok_or_else(|| Error::invalid("pose", "is required"))?;
 
@@ -247,11 +255,15 @@ impl StreamFrames {
             within(field, given.unwrap_or(DRIFT_SHARE), DRIFT_SHARES)
         };
 
+        let of_base = self.base_from_camera.filter(|_| body == Body::Base);
+        let of_body = velocity_noise(&velocity_covariance)?;
+        let to_camera = of_base.map_or_else(Matrix6::identity, |base_from_camera| {
+            adjoint(&base_from_camera.inverse())
+        });
         Ok(MeasuredPose {
-            pose: match (body, self.base_from_camera) {
-                (Body::Base, Some(base_from_camera)) => pose * base_from_camera,
-                _ => pose,
-            },
+            pose: of_base.map_or(pose, |base_from_camera| pose * base_from_camera),
+            velocity_covariance: of_body
+                .map(|covariance| to_camera * covariance * to_camera.transpose()),
             drift: Drift {
                 translation_share: share("translation_share", translation_share)?,
                 rotation_share: share("rotation_share", rotation_share)?,
@@ -304,6 +316,43 @@ pub fn unnamed(pose: pb::Pose) -> Result<Pose, Error> {
     }
 
     convert::pose(pose, "")
+}
+
+/// A covariance of velocities, row by row; `None` if it is empty.
+///
+/// # Errors
+/// [`Error::Invalid`] for another number of values, and for a matrix that is not symmetric and positive
+/// semidefinite, or zero.
+fn velocity_noise(given: &[f64]) -> Result<Option<Matrix6<f64>>, Error> {
+    let invalid = |problem: String| Error::invalid("velocity_covariance", problem);
+    if given.is_empty() {
+        return Ok(None);
+    }
+    if given.len() != 36 {
+        return Err(invalid(format!(
+            "must have 36 numbers, not {}",
+            given.len()
+        )));
+    }
+
+    let covariance = Matrix6::from_row_slice(given);
+    let largest = covariance.amax();
+    let is_finite = given.iter().all(|value| value.is_finite());
+    let is_symmetric = (covariance - covariance.transpose()).amax() <= ASYMMETRY * largest;
+    let least = if is_finite {
+        covariance.symmetric_eigenvalues().min()
+    } else {
+        f64::NAN
+    };
+    let is_positive = covariance.diagonal().min() >= 0.0 && least >= -ASYMMETRY * largest;
+    if !(is_finite && largest > 0.0 && is_symmetric && is_positive) {
+        let problem = "must be finite, symmetric, positive semidefinite and not zero";
+        return Err(invalid(problem.to_owned()));
+    }
+
+    // Rounding may have made an eigenvalue negative.
+    let symmetric = (covariance + covariance.transpose()) * 0.5;
+    Ok(Some(symmetric + Matrix6::identity() * (-least).max(0.0)))
 }
 
 pub fn clear_name(name: &mut String, own: &str) {

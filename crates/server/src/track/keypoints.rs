@@ -16,8 +16,10 @@ pub struct StreamRooms<'a> {
     pub source: &'a KeypointSource,
     /// The stream's room, an index of `rooms`; `None` while it is unknown.
     pub room: Option<usize>,
-    /// The last pose of the camera in that room, `world_from_camera`.
+    /// The pose of the camera at the last frame in that room, `world_from_camera`.
     pub predicted: Option<Pose>,
+    /// The motion since the last frame, if a sensor measures it.
+    pub motion: Option<Pose>,
 }
 
 impl StreamRooms<'_> {
@@ -66,13 +68,15 @@ impl StreamRooms<'_> {
             }
         }
 
+        let moved = |pose: Pose| self.motion.map_or(pose, |motion| pose * motion);
+        let predicted = self.predicted.map(moved);
         let image = StreamImage {
             time_ns,
             keypoints: &image.keypoints,
             height: height as f64 / width as f64,
             fingerprint: image.fingerprint(),
-            predicted: self.predicted.filter(|_| self.room.is_some()),
-            predicted_motion: None,
+            predicted: predicted.filter(|_| self.room.is_some()),
+            predicted_motion: self.motion,
         };
         Ok(front_end.read(&image, &candidates))
     }

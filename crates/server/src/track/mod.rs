@@ -6,6 +6,7 @@
 
 mod configuration;
 mod engine;
+mod inertial;
 mod keypoints;
 mod rooms;
 mod sealed;
@@ -30,6 +31,7 @@ use super::auth::{Keyring, Principal};
 use super::status::Full;
 use super::workers::Lane;
 use super::{Error, Handlers, Phase, principal};
+use inertial::MOST_SAMPLES;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::track_request::Message;
 use seese3_client::proto::v1::track_response::Answer;
@@ -325,10 +327,11 @@ fn message_of(next: Result<pb::TrackRequest, Status>) -> Result<Message, Status>
 }
 
 /// Replaces the waiting frame `before` by the newer frame `came`, which then counts it as
-/// superseded. Returns `before` if it needs its own answer: if either message is not a frame, or
-/// `came` is not later in both time and sequence.
-fn overtake(before: Incoming, came: &mut Incoming) -> Option<Incoming> {
-    let (Ok(Message::Frame(old)), Ok(Message::Frame(new))) = (&before.message, &came.message)
+/// superseded, and takes its inertial samples. Returns `before` if it needs its own answer: if either
+/// message is not a frame, or `came` is not later in both time and sequence.
+fn overtake(mut before: Incoming, came: &mut Incoming) -> Option<Incoming> {
+    let (Ok(Message::Frame(old)), Ok(Message::Frame(new))) =
+        (&mut before.message, &mut came.message)
     else {
         return Some(before);
     };
@@ -337,6 +340,13 @@ fn overtake(before: Incoming, came: &mut Incoming) -> Option<Incoming> {
     if new.timestamp_ns <= old.timestamp_ns || new.sequence <= old.sequence {
         return Some(before);
     }
+
+    let mut samples = std::mem::take(&mut old.inertial_samples);
+    let first_ns = new.inertial_samples.first().map(|first| first.timestamp_ns);
+    samples.retain(|sample| first_ns.is_none_or(|first_ns| sample.timestamp_ns < first_ns));
+    samples.append(&mut new.inertial_samples);
+    samples.drain(..samples.len().saturating_sub(MOST_SAMPLES));
+    new.inertial_samples = samples;
 
     let frames = before
         .overtaken

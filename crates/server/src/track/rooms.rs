@@ -12,6 +12,7 @@ use super::super::snapshot::{
 use seese3_client::proto::v1 as pb;
 use seese3_core::navigation::RetrievedFrame;
 use seese3_core::room::Room;
+use seese3_robot::pose_filter::FilterParameters;
 use seese3_store::StoredAdapter;
 
 /// A room in which a stream tracks its camera.
@@ -24,6 +25,8 @@ pub struct TrackedRoom {
     pub keypoints: Option<ServedKeypoints>,
     /// The room under the stream's adapter; `None` for a stream without an adapter.
     pub served: Option<Arc<ServedNavigator>>,
+    /// Parameters of filters that were fitted to the room.
+    pub tracking: Option<FilterParameters>,
     /// SHA-256 of all frames, see [`frames_content`].
     content: [u8; 32],
 }
@@ -35,6 +38,7 @@ impl TrackedRoom {
             revision: convert::room_revision(&served),
             room: served.navigator.room().clone(),
             keypoints: served.keypoints.clone(),
+            tracking: served.tracking,
             content: served.content.frames,
             served: Some(served),
         }
@@ -50,6 +54,7 @@ impl TrackedRoom {
             revision: super::super::localization::room_to_wire(served),
             room: loaded.room.clone(),
             keypoints: loaded.keypoints.clone(),
+            tracking: loaded.tracking,
             content: frames_content(&loaded.room, None, loaded.room.frame_count()),
             served: None,
         })

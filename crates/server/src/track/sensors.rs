@@ -118,6 +118,11 @@ impl Sensors {
         })
     }
 
+    /// The direction of gravity in the room's world frame, if it is known.
+    pub fn gravity_in_map(&self) -> Option<Unit<Vector3<f64>>> {
+        self.gravity_in_map
+    }
+
     /// The other camera of this name.
     ///
     /// # Errors

@@ -11,6 +11,7 @@ use super::super::snapshot::Snapshot;
 use super::Overtaken;
 use super::configuration::{StreamFrames, back_pressure, is_fused, parameters, rooms};
 use super::engine::Engine;
+use super::inertial::Inertial;
 use super::keypoints::{StreamRooms, stream_camera};
 use super::rooms::{TrackedRoom, rooms_with_keypoints};
 use super::sealed::Sealed;
@@ -23,7 +24,7 @@ use seese3_core::geometry::Pose;
 use seese3_core::keypoints::{KeypointSource, Keypoints};
 use seese3_robot::front_end::{FrontEnd, ImageReading, StreamView};
 use seese3_robot::localization::NotLocated;
-use seese3_robot::pose_filter::ViewObservation;
+use seese3_robot::pose_filter::{FilterParameters, ViewObservation};
 use seese3_robot::tracking::{MeasuredPose, PoseWithCovariance, Refusal, Status, Update};
 use seese3_robot::visual_odometry::OdometryParameters;
 
@@ -40,6 +41,7 @@ pub struct Session {
     config: pb::TrackConfig,
     frames: StreamFrames,
     sensors: Sensors,
+    inertial: Option<Inertial>,
     front_end: FrontEnd,
     /// The map pose of the last view, `world_from_camera`, if the view was located while TRACKING.
     last_pose: Option<Pose>,
@@ -110,6 +112,7 @@ impl Session {
         // Validate everything before the stream starts.
         let frames = StreamFrames::of(&config)?;
         let sensors = Sensors::of(&config, &frames)?;
+        let inertial = Inertial::of(&config, &frames, sensors.gravity_in_map())?;
         let camera = stream_camera(&config)?;
         back_pressure(config.back_pressure)?;
 
@@ -134,7 +137,8 @@ impl Session {
             ));
         }
 
-        let parameters = parameters(&config)?;
+        // Invalid settings are refused before any room is loaded.
+        parameters(&config, FilterParameters::default())?;
         let (rooms, maps) = match rooms_with_keypoints(snapshot, &config, was_of_keypoints)? {
             Some(_) if !config.other_cameras.is_empty() => {
                 let problem = "needs an adapter that can track in these rooms; leave it out";
@@ -148,6 +152,12 @@ impl Session {
                 (rooms, Some(maps))
             }
         };
+        // A stream that has to find its room takes the default parameters.
+        let fitted = match &rooms[..] {
+            [only] => only.tracking.unwrap_or_default(),
+            _ => FilterParameters::default(),
+        };
+        let parameters = parameters(&config, fitted)?;
         let engine = Engine::new(&rooms, maps, parameters, begins.as_ref())?;
 
         let encoders = snapshot.without_rooms();
@@ -160,6 +170,7 @@ impl Session {
             config,
             frames,
             sensors,
+            inertial,
             front_end: FrontEnd::new(camera, odometry),
             last_pose: None,
             is_lost: false,
@@ -336,6 +347,9 @@ impl Session {
     pub fn reset(&mut self) -> pb::TrackResponse {
         self.engine.reset();
         self.front_end.reset();
+        if let Some(inertial) = &mut self.inertial {
+            inertial.reset();
+        }
         self.last_pose = None;
         self.is_lost = false;
         self.answer(pb::track_response::Answer::Acknowledged(
@@ -349,8 +363,14 @@ impl Session {
         self.engine.room().filter(|_| !self.is_lost)
     }
 
-    /// Reads the keypoints of the stream's own image.
-    fn read(&mut self, image: &ImageKeypoints, time_ns: i64) -> Result<ImageReading, Error> {
+    /// Reads the keypoints of the stream's own image. `motion` is that since the last frame, if a
+    /// sensor measures it.
+    fn read(
+        &mut self,
+        image: &ImageKeypoints,
+        time_ns: i64,
+        motion: Option<Pose>,
+    ) -> Result<ImageReading, Error> {
         let Some(source) = keypoint_source(&self.rooms, &self.encoders).cloned() else {
             return Ok(ImageReading::default());
         };
@@ -360,6 +380,7 @@ impl Session {
             source: &source,
             room,
             predicted: self.last_pose,
+            motion,
         };
         rooms.read(&mut self.front_end, "frame.view.image", image, time_ns)
     }
@@ -374,6 +395,23 @@ impl Session {
             frames: StoredFrames::Refused,
             detector: source.and_then(|source| self.encoders.keypoint_encoder(source)),
         })
+    }
+
+    /// Adds the inertial samples of a frame; returns the middle of its exposure, if the stream has an
+    /// inertial sensor.
+    fn add_inertial(&mut self, frame: &pb::TrackFrame) -> Result<Option<i64>, Error> {
+        match &mut self.inertial {
+            Some(inertial) => {
+                let middle_ns = inertial.middle_ns(frame)?;
+                inertial.add(&frame.inertial_samples)?;
+                Ok(Some(middle_ns))
+            }
+            None if frame.inertial_samples.is_empty() => Ok(None),
+            None => Err(Error::invalid(
+                "inertial_samples",
+                "need inertial_sensor in the configuration",
+            )),
+        }
     }
 
     /// Encodes the views of a frame's other cameras.
@@ -404,6 +442,8 @@ impl Session {
     }
 
     fn observe(&mut self, frame: pb::TrackFrame) -> Result<Update, Refused> {
+        // Inertial samples hold whatever becomes of their frame.
+        let middle_ns = self.add_inertial(&frame);
         // A refused frame must not change what later views are compared with.
         let Engine { filter, state, .. } = &self.engine;
         filter.check(state, frame.timestamp_ns, frame.sequence)?;
@@ -415,20 +455,38 @@ impl Session {
             .map(|given| self.sensors.gravity(given))
             .transpose()
             .map_err(|error| refused(Reason::Gravity)(error.within("frame.gravity")))?;
+        let middle_ns =
+            middle_ns.map_err(|error| refused(Reason::Inertial)(error.within("frame")))?;
+        let inertia = self.inertial.as_ref().zip(middle_ns);
+        let inertia = inertia.and_then(|(inertial, at_ns)| inertial.motion_to(at_ns));
+        let sensed = ViewObservation {
+            measured,
+            gravity,
+            inertia,
+            ..ViewObservation::empty(frame.timestamp_ns, frame.sequence)
+        };
+        let Engine { filter, state, .. } = &self.engine;
+        let motion = filter.sensed_motion(state, &sensed);
         let (observed, contradicted) = match self.engine.retrieval {
-            Some(_) => self.retrieved(frame),
-            None => self.detected(frame).map(|observed| (observed, None)),
+            Some(_) => self.retrieved(frame, motion),
+            None => self
+                .detected(frame, motion)
+                .map(|observed| (observed, None)),
         }
         .map_err(refused(Reason::View))?;
 
         let observation = ViewObservation {
-            measured,
-            gravity,
+            measured: sensed.measured,
+            gravity: sensed.gravity,
+            inertia: sensed.inertia,
             ..observed
         };
 
         let Engine { filter, state, .. } = &mut self.engine;
         let update = filter.observe(state, &observation)?;
+        if let Some((inertial, at_ns)) = self.inertial.as_mut().zip(middle_ns) {
+            inertial.accept(at_ns);
+        }
         let tracked = update
             .map_pose
             .filter(|_| update.status == Status::Tracking && update.match_used);
@@ -448,11 +506,12 @@ impl Session {
     fn retrieved(
         &mut self,
         frame: pb::TrackFrame,
+        motion: Option<Pose>,
     ) -> Result<(ViewObservation, Option<NotLocated>), Error> {
         let own = self.embedder(true)?.embed("frame.view", frame.view)?;
         let others = self.encoded_other_views(frame.other_views)?;
         let image = match &own.keypoints {
-            Some(image) if !own.is_blank => self.read(image, frame.timestamp_ns)?,
+            Some(image) if !own.is_blank => self.read(image, frame.timestamp_ns, motion)?,
             _ => {
                 self.front_end.skip(frame.timestamp_ns);
                 ImageReading::default()
@@ -481,13 +540,17 @@ impl Session {
     }
 
     /// The observation of a frame by the keypoints of its image alone.
-    fn detected(&mut self, frame: pb::TrackFrame) -> Result<ViewObservation, Error> {
+    fn detected(
+        &mut self,
+        frame: pb::TrackFrame,
+        motion: Option<Pose>,
+    ) -> Result<ViewObservation, Error> {
         if !frame.other_views.is_empty() {
             let problem = "needs an adapter that can track in this room; leave it out";
             return Err(Error::invalid("frame.other_views", problem));
         }
         let image = self.keypoints_of(frame.view)?;
-        let read = self.read(&image, frame.timestamp_ns)?;
+        let read = self.read(&image, frame.timestamp_ns, motion)?;
         let fingerprint = image.fingerprint();
         Ok(read.observation(frame.timestamp_ns, frame.sequence, fingerprint))
     }

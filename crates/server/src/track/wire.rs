@@ -5,7 +5,7 @@ use super::configuration::StreamFrames;
 use super::rooms::TrackedRoom;
 use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::{Pose, Twist, adjoint};
-use seese3_robot::tracking::{PoseWithCovariance, Status, Update};
+use seese3_robot::tracking::{PoseWithCovariance, Sensor, Status, Update};
 
 /// Converts an update. The session fills in `timestamp_ns`, `sequence`, `elapsed_ns` and
 /// `best_camera`.
@@ -79,6 +79,11 @@ pub fn update(update: &Update, frames: &StreamFrames, rooms: &[TrackedRoom]) -> 
             convert::twist_to_wire(&Twist::from_vector(&velocity))
         }),
         best_camera: String::new(),
+        contradicted: update
+            .contradicted
+            .iter()
+            .map(|&of| sensor(of) as i32)
+            .collect(),
     }
 }
 
@@ -100,6 +105,16 @@ fn status(status: Status) -> pb::TrackStatus {
         Status::Degraded => pb::TrackStatus::Degraded,
         Status::Lost => pb::TrackStatus::Lost,
         Status::Relocalizing => pb::TrackStatus::Relocalizing,
+    }
+}
+
+fn sensor(sensor: Sensor) -> pb::TrackSensor {
+    match sensor {
+        Sensor::Wheels => pb::TrackSensor::Odometry,
+        Sensor::Images => pb::TrackSensor::Images,
+        Sensor::Inertia => pb::TrackSensor::Inertial,
+        Sensor::Gravity => pb::TrackSensor::Gravity,
+        Sensor::Views => pb::TrackSensor::Views,
     }
 }
 

@@ -380,6 +380,211 @@ async fn measurements_that_are_none_are_refused() {
     }
 }
 
+/// What a sensor in these axes measures between a row and the one before, five samples at constant rates.
+/// The timestamps are 20 ms early.
+fn gyroscope(
+    row: usize,
+    base_from_camera: &Pose,
+    base_from_sensor: &Pose,
+) -> Vec<pb::InertialSample> {
+    let (room, _) = served("hall");
+    let Some(before) = row.checked_sub(1) else {
+        return Vec::new();
+    };
+    let sensor_from_camera = base_from_sensor.inv_mul(base_from_camera);
+    let turn = room.poses()[before].inv_mul(&room.poses()[row]).rotation;
+    let rate = sensor_from_camera.rotation * (turn.scaled_axis() / 0.033);
+    (0..5)
+        .map(|part| pb::InertialSample {
+            timestamp_ns: before as i64 * 33_000_000 + part * 6_600_000 - 20_000_000,
+            angular_velocity: Some(wire(rate)),
+            linear_acceleration: Some(wire(Vector3::y() * -9.8)),
+        })
+        .collect()
+}
+
+/// Oracle: the turns of the camera, measured by a sensor that is mounted in other axes on the base and
+/// whose clock is 20 ms slow. The views of the second half show nothing known.
+#[tokio::test]
+async fn a_gyroscope_turns_the_pose_where_nothing_is_seen() {
+    let server = start_followed(Default::default()).await;
+    let (room, _) = served("hall");
+    let base_from_camera = Pose::new(Vector3::new(0.1, 0.0, 0.3), Vector3::new(0.2, -1.1, 0.4));
+    let base_from_sensor = Pose::new(Vector3::new(0.0, 0.2, 0.1), Vector3::new(-0.7, 0.3, 1.9));
+    let with_sensor = pb::TrackConfig {
+        base_from_camera: Some(convert::pose_to_wire(
+            &base_from_camera,
+            "base_link",
+            "camera",
+        )),
+        inertial_sensor: Some(pb::InertialSensor {
+            pose: Some(convert::pose_to_wire(&base_from_sensor, "base_link", "imu")),
+            time_offset_ns: 20_000_000,
+            ..pb::InertialSensor::default()
+        }),
+        ..config()
+    };
+
+    let mut errors = Vec::new();
+    for has_samples in [true, false] {
+        let frames = (0..60).map(|row| {
+            changed(row, |frame| {
+                if row >= 30 {
+                    frame.view = row_of("attic", 0);
+                }
+                if has_samples {
+                    frame.inertial_samples = gyroscope(row, &base_from_camera, &base_from_sensor);
+                }
+            })
+        });
+        let found = updates(&server, with_sensor.clone(), frames).await;
+        let last = pose(found[59].map_from_camera.as_ref());
+        errors.push(PoseError::between(&last, &room.poses()[59]).rotation_rad);
+    }
+    assert!(
+        errors[0] < 0.05 && errors[1] > 3.0 * errors[0],
+        "{errors:?}"
+    );
+}
+
+/// Oracle: the contract: samples and exposures that are none are refused with the field.
+#[tokio::test]
+async fn inertial_samples_that_are_none_are_refused() {
+    let server = start_followed(Default::default()).await;
+    let rig = pb::TrackConfig {
+        inertial_sensor: Some(pb::InertialSensor::default()),
+        ..config()
+    };
+    let sample = |timestamp_ns: i64, rate: f64| pb::InertialSample {
+        timestamp_ns,
+        angular_velocity: Some(wire(Vector3::new(rate, 0.0, 0.0))),
+        linear_acceleration: Some(wire(Vector3::y() * -9.8)),
+    };
+    let without = pb::InertialSample {
+        linear_acceleration: None,
+        ..sample(5, 0.0)
+    };
+    let cases = [
+        (
+            vec![sample(5, f64::NAN)],
+            "inertial_samples[0].angular_velocity",
+        ),
+        (
+            vec![sample(5, 101.0)],
+            "inertial_samples[0].angular_velocity",
+        ),
+        (vec![without], "inertial_samples[0].linear_acceleration"),
+        (
+            vec![sample(5, 0.0), sample(5, 0.0)],
+            "inertial_samples[1].timestamp_ns",
+        ),
+        (
+            (0..2_001).map(|time| sample(time, 0.0)).collect(),
+            "inertial_samples: must be at most 2000",
+        ),
+    ];
+    let refusal = |answer: &pb::TrackResponse| match &answer.answer {
+        Some(Answer::Refusal(refusal)) => refusal.clone(),
+        other => panic!("{other:?}"),
+    };
+    for (samples, says) in cases {
+        let bad = changed(1, |frame| frame.inertial_samples.clone_from(&samples));
+        let heard = answers(&server, vec![begin(rig.clone()), seen(0), bad, seen(2)]).await;
+        let heard = heard.unwrap();
+        let refused = refusal(&heard[2]);
+        assert_eq!(refused.reason(), pb::TrackRefusalReason::Inertial);
+        assert!(
+            refused.message.contains(says),
+            "{}: {says}",
+            refused.message
+        );
+        assert!(matches!(&heard[3].answer, Some(Answer::Update(_))));
+    }
+
+    let unknown = changed(0, |frame| frame.inertial_samples = vec![sample(5, 0.0)]);
+    let long = changed(0, |frame| frame.exposure_ns = 1_000_000_001);
+    for (config, bad, says) in [
+        (
+            config(),
+            unknown,
+            "need inertial_sensor in the configuration",
+        ),
+        (rig, long, "frame.exposure_ns"),
+    ] {
+        let heard = answers(&server, vec![begin(config), bad]).await.unwrap();
+        let refused = refusal(&heard[1]);
+        assert!(
+            refused.message.contains(says),
+            "{}: {says}",
+            refused.message
+        );
+    }
+
+    // A noise of zero would make the covariance singular.
+    let silent = pb::TrackConfig {
+        inertial_sensor: Some(pb::InertialSensor {
+            gyroscope_noise: Some(0.0),
+            ..pb::InertialSensor::default()
+        }),
+        ..config()
+    };
+    let error = answers(&server, vec![begin(silent)]).await.unwrap_err();
+    let says = "config.inertial_sensor.gyroscope_noise";
+    assert!(error.message().contains(says), "{}", error.message());
+}
+
+/// Oracle: the contract: a covariance of velocities has 36 numbers, is symmetric and positive semidefinite, and
+/// not zero.
+#[tokio::test]
+async fn a_covariance_of_velocities_is_checked() {
+    let server = start_followed(Default::default()).await;
+    let with_covariance = |covariance: Vec<f64>| {
+        changed(0, move |frame| {
+            frame.odometry = Some(pb::MeasuredOdometry {
+                pose: Some(convert::pose_to_wire(&Pose::identity(), "odom", "")),
+                velocity_covariance: covariance.clone(),
+                ..pb::MeasuredOdometry::default()
+            });
+        })
+    };
+    let diagonal = |values: [f64; 6]| {
+        nalgebra::Matrix6::from_diagonal(&values.into())
+            .as_slice()
+            .to_vec()
+    };
+    let mut skew = diagonal([1.0; 6]);
+    skew[1] = 0.5;
+    let cases = [
+        (diagonal([1e-4; 6]), None),
+        // Planar wheels know nothing of three axes.
+        (diagonal([1e-4, 1e-4, 1e6, 1e6, 1e6, 1e-4]), None),
+        (vec![1.0; 35], Some("must have 36 numbers, not 35")),
+        (diagonal([0.0; 6]), Some("not zero")),
+        (
+            diagonal([1.0, -1.0, 1.0, 1.0, 1.0, 1.0]),
+            Some("positive semidefinite"),
+        ),
+        (skew, Some("symmetric")),
+        (diagonal([f64::NAN; 6]), Some("finite")),
+    ];
+    for (covariance, problem) in cases {
+        let requests = vec![begin(config()), with_covariance(covariance)];
+        let heard = answers(&server, requests).await.unwrap();
+        match (&heard[1].answer, problem) {
+            (Some(Answer::Update(_)), None) => {}
+            (Some(Answer::Refusal(refusal)), Some(says)) => {
+                let field = "frame.odometry.velocity_covariance";
+                let message = &refusal.message;
+                assert!(
+                    message.contains(field) && message.contains(says),
+                    "{message}"
+                );
+            }
+            (answer, problem) => panic!("{problem:?}: {answer:?}"),
+        }
+    }
+}
+
 /// Oracle: the contract: a configuration that names no possible rig is refused by its field.
 #[tokio::test]
 async fn rigs_that_are_none_are_refused() {

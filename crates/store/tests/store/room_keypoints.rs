@@ -6,10 +6,14 @@ use std::sync::Arc;
 use ndarray::{Array1, Array2};
 
 use seese3_core::features::{FeatureSource, Features};
+use seese3_core::geometry::Pose;
 use seese3_core::keypoints::KeypointSource;
-use seese3_core::room::{Frames, Provenance, Room, RoomId};
+use seese3_core::nalgebra::{Point3, Vector3};
+use seese3_core::room::{FrameId, Frames, Provenance, Room, RoomId};
+use seese3_core::trajectory::Similarity;
 use seese3_robot::matched_views::{COMPRESSED, DescriptorBasis, KeypointMap, MappedKeypoints};
-use seese3_store::{Error, OtherFeatures, RoomContents, RoomKeypoints, Store};
+use seese3_robot::pose_filter::{FilterParameters, MotionNoise};
+use seese3_store::{EditedRoom, Error, OtherFeatures, RoomContents, RoomKeypoints, Store};
 
 use crate::store::{files, stored};
 use seese3_testing::keypoint_map::{UNIT_M, keypoint_map};
@@ -421,4 +425,120 @@ async fn a_damaged_file_of_keypoints_is_found() {
     );
     let refused = store.load_room("a", None).await.unwrap_err();
     assert!(matches!(refused, Error::Damaged { .. }), "{refused}");
+}
+
+/// Oracle: the contract of published parameters: they come back in the next revision, with everything else
+/// as it was, stay with other features and more frames, and are refused if no filter can have them.
+#[tokio::test]
+async fn parameters_of_tracking_are_published_with_a_room() {
+    let sent = keypoints(FRAMES, 5);
+    let (folder, store) = begun(&sent).await;
+    let parameters = FilterParameters {
+        process_noise_factor: 7.0,
+        visual_noise: MotionNoise {
+            over_radian: 0.125,
+            ..MotionNoise::IMAGES
+        },
+        // A setting of one stream, which is not stored.
+        fuse: false,
+        ..FilterParameters::default()
+    };
+    let stored = FilterParameters {
+        fuse: true,
+        ..parameters
+    };
+
+    let published = store.publish_tracking("a", Some(parameters)).await;
+    assert_eq!(published.unwrap().revision, 2);
+    let again = store.publish_tracking("a", Some(parameters)).await;
+    assert!(!again.unwrap().is_new);
+    let back = store.load_room("a", None).await.unwrap();
+    assert_eq!(back.tracking, Some(stored));
+    assert_eq!(back.features.len(), 1);
+    assert!(back.keypoints.is_some());
+
+    let published = store.publish_room(&room("a"), &[set("g", 2.0)]).await;
+    assert_eq!(published.unwrap().revision, 3);
+    let back = store.load_room("a", None).await.unwrap();
+    assert_eq!(back.tracking, Some(stored));
+    let former = store.load_room("a", Some(1)).await.unwrap();
+    assert_eq!(former.tracking, None);
+
+    let removed = store.publish_tracking("a", None).await.unwrap();
+    assert_eq!(removed.revision, 4);
+    assert!(store.verify(&|_| ()).await.unwrap().is_empty());
+    let unknown = store.publish_tracking("nowhere", None).await.unwrap_err();
+    assert!(matches!(unknown, Error::Unknown { .. }), "{unknown}");
+
+    let impossible = FilterParameters {
+        process_noise_factor: -1.0,
+        ..parameters
+    };
+    store
+        .publish_tracking("a", Some(impossible))
+        .await
+        .unwrap_err();
+    let manifests = folder.path().join("rooms/a/revisions");
+    assert!(!manifests.join("000005.json").exists());
+}
+
+/// Oracle: composition by hand. A crop keeps what belongs to the frames; a similarity moves cameras and the
+/// points of the map alike; joined rooms have the frames of both, in sequences of their own.
+#[tokio::test]
+async fn rooms_are_cropped_moved_and_merged() {
+    let sent = keypoints(FRAMES, 5);
+    let (_folder, store) = begun(&sent).await;
+    let stored = store.load_room("a", None).await.unwrap();
+    let name = RoomId::new("b").unwrap();
+    let whole = EditedRoom::of(&stored, &name).unwrap();
+
+    let rows = [7, 8, 20];
+    let cropped = whole.cropped(&rows).unwrap();
+    let contents = cropped.contents();
+    assert_eq!(contents.room.id(), &name);
+    assert_eq!(contents.room.poses()[2], stored.room.poses()[20]);
+    let row = |set: &Features, row: usize| set.rows().row(row).to_vec();
+    assert_eq!(row(&contents.features[0], 1), row(&stored.features[0], 8));
+    let known = stored.keypoints.as_ref().unwrap();
+    let kept = &contents.keypoints.unwrap().map.frames;
+    assert_eq!(kept[2], known.map.frames[20]);
+    let timeline = contents.room.timeline();
+    assert!(timeline.joins(FrameId(0), FrameId(1)) && !timeline.joins(FrameId(1), FrameId(2)));
+    assert!(whole.cropped(&[]).is_err());
+
+    let new_from_old = Similarity {
+        scale: 2.0,
+        reference_from_estimate: Pose::new(
+            Vector3::new(1.0, 2.0, 3.0),
+            Vector3::new(0.1, 0.2, 0.3),
+        ),
+    };
+    let moved = whole.transformed(&new_from_old).unwrap();
+    let moved_map = &moved.contents().keypoints.unwrap().map;
+    near("unit", moved_map.unit_m, 2.0 * known.map.unit_m, 1e-9);
+    let point = |map: &KeypointMap, pose: &Pose, frame: usize| {
+        pose * Point3::from(map.frames[frame].point(0, &map.camera))
+    };
+    for frame in [1, 2, 3] {
+        let before = point(&known.map, &stored.room.poses()[frame], frame);
+        let after = point(moved_map, &moved.room().poses()[frame], frame);
+        let expected = new_from_old.reference_from_estimate * (before * 2.0);
+        assert!(
+            (after - expected).norm() < 1e-4 * expected.coords.norm(),
+            "{after}"
+        );
+    }
+
+    let merged = cropped.merged(&moved).unwrap();
+    let published = store.publish_contents(merged.contents()).await.unwrap();
+    assert!(published.is_new);
+    let back = store.load_room("b", None).await.unwrap();
+    assert_eq!(back.room.frame_count(), rows.len() + FRAMES);
+    assert!(!back.room.timeline().joins(FrameId(2), FrameId(3)));
+    let frames = &back.keypoints.as_ref().unwrap().map.frames;
+    assert_eq!(frames[0].len(), known.map.frames[7].len());
+    assert_eq!(frames[rows.len() + 1].len(), known.map.frames[1].len());
+    let off = back.room.poses()[rows.len()].inv_mul(&moved.room().poses()[0]);
+    assert!(off.translation.vector.norm() < 1e-9);
+    assert!(store.verify(&|_| ()).await.unwrap().is_empty());
 }

@@ -1,0 +1,292 @@
+//! Parameters of a filter.
+
+use nalgebra::{Matrix6, Vector6};
+
+use seese3_core::geometry::{Pose, Twist, log};
+
+/// Parameters of a filter. In a file, the settings of one stream are left out: `trust_wheels`, the two of
+/// keyframes, and `fuse`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(
+    feature = "serde",
+    derive(serde::Serialize, serde::Deserialize),
+    serde(default, deny_unknown_fields)
+)]
+pub struct FilterParameters {
+    /// Poses of views that are matched by keypoints.
+    pub matched: LocatedParameters,
+    /// Poses by the most similar mapped frames.
+    pub retrieved: LocatedParameters,
+    /// Distance, meters, and angle, radians, over which the correlated part of the errors of located
+    /// poses decays by a factor e. It is the error of the map in view: a camera at rest does not
+    /// average it out.
+    pub correlation_range: [f64; 2],
+    /// Factor on the process noise of the motion prior: a person turns and stops more abruptly than
+    /// a Gaussian process.
+    pub process_noise_factor: f64,
+    /// Squared Mahalanobis length of an innovation above which a located pose counts less: its
+    /// covariance is multiplied by the square of length / gate.
+    pub gate: f64,
+    /// Squared Mahalanobis length of an innovation above which a located pose is not used.
+    pub outlier_gate: f64,
+    /// Maximum time between two poses that agree, seconds. After a longer gap, an uncertain belief
+    /// needs `views_to_agree` poses again.
+    pub max_candidate_s: f64,
+    /// Time without a located view and without visual odometry after which a stream is DEGRADED,
+    /// seconds.
+    pub max_unlocated_s: f64,
+    /// Squared Mahalanobis length of a tilt above which gravity counts less.
+    pub gravity_gate: f64,
+    /// Correlation time of the direction of measured gravity, seconds. Its errors come mostly from
+    /// accelerations.
+    pub gravity_correlation_s: f64,
+    /// Largest standard deviations of the position along any direction, meters, and of the rotation
+    /// about any axis, radians, while TRACKING.
+    pub max_deviation: [f64; 2],
+    /// Independent noise of wheel odometry.
+    pub wheel_noise: MotionNoise,
+    /// Independent noise of visual odometry.
+    pub visual_noise: MotionNoise,
+    /// Factor on the stated covariance of visual odometry, which takes its matches as independent.
+    pub visual_design_effect: f64,
+    /// Time for which wrong depths turn the translation of visual odometry the same way, seconds. Their
+    /// relative deviation is that of the scale.
+    pub visual_depth_time_s: f64,
+    /// Correlation time of the error of the scale of visual odometry, seconds.
+    pub visual_scale_time_s: f64,
+    /// Whether wheel odometry is trusted: it is not left out where other sensors contradict it, and
+    /// located views do not replace a pose that it carries.
+    #[cfg_attr(feature = "serde", serde(skip))]
+    pub trust_wheels: bool,
+    /// Time over which the differences of two sensors are summed, and for which a stream is DEGRADED
+    /// after they contradicted each other, seconds.
+    pub disagreement_time_s: f64,
+    /// Largest speed of a measured motion, meters and radians per second. A faster one is a restart of
+    /// the sensor.
+    pub max_speed: [f64; 2],
+    /// Number of consecutive identical images after which a stream is DEGRADED.
+    pub max_unchanged_frames: u32,
+    /// Interval of keyframes, in frames; at least 1.
+    #[cfg_attr(feature = "serde", serde(skip))]
+    pub keyframe_frames: u32,
+    /// Motion since the keyframe that triggers a new one, ‖(v, ω)‖, meters and radians mixed.
+    #[cfg_attr(feature = "serde", serde(skip))]
+    pub keyframe_displacement: f64,
+    /// Whether located poses are used.
+    #[cfg_attr(feature = "serde", serde(skip))]
+    pub fuse: bool,
+}
+
+/// Parameters of located poses from one kind of source.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct LocatedParameters {
+    /// Share of the variance of a pose that is correlated from view to view, 0 to 1.
+    pub correlated_share: f64,
+    /// Number of consecutive poses that must agree to start the tracking, or to replace a pose that
+    /// they contradict.
+    pub views_to_agree: u32,
+}
+
+impl Default for FilterParameters {
+    fn default() -> Self {
+        Self {
+            matched: LocatedParameters {
+                correlated_share: 0.7,
+                views_to_agree: 2,
+            },
+            retrieved: LocatedParameters {
+                correlated_share: 0.7,
+                views_to_agree: 10,
+            },
+            correlation_range: [0.15, 0.15],
+            process_noise_factor: 4.0,
+            // The 99 % quantile of χ² with six degrees of freedom, and four times that.
+            gate: 16.81,
+            outlier_gate: 67.24,
+            max_candidate_s: 5.0,
+            max_unlocated_s: 0.1,
+            // The 99 % quantile of χ² with two degrees of freedom.
+            gravity_gate: 9.21,
+            gravity_correlation_s: 2.0,
+            // Errors of 0.2 m and 10° are 2.6 standard deviations: rarer than 1 in 100.
+            max_deviation: [0.077, 0.067],
+            wheel_noise: MotionNoise::WHEELS,
+            visual_noise: MotionNoise::IMAGES,
+            visual_design_effect: 10.0,
+            visual_depth_time_s: 1.0,
+            visual_scale_time_s: 10.0,
+            trust_wheels: false,
+            disagreement_time_s: 1.0,
+            max_speed: [10.0, 15.0],
+            max_unchanged_frames: 5,
+            keyframe_frames: 30,
+            keyframe_displacement: f64::INFINITY,
+            fuse: true,
+        }
+    }
+}
+
+/// Independent noise of measured motions: standard deviations per axis. Variances grow in proportion
+/// to the distance and the angle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct MotionNoise {
+    /// At rest, meters and radians.
+    pub at_rest: [f64; 2],
+    /// Over a distance of 1 m, meters and radians.
+    pub over_meter: [f64; 2],
+    /// Of the rotation, over an angle of 1 rad, radians.
+    pub over_radian: f64,
+}
+
+impl MotionNoise {
+    /// Noise of wheel odometry, besides its drift.
+    pub const WHEELS: Self = Self {
+        at_rest: [5e-4, 5e-4],
+        over_meter: [1e-2, 5e-3],
+        over_radian: 0.0,
+    };
+
+    /// Noise of visual odometry, besides the error of its scale.
+    pub const IMAGES: Self = Self {
+        at_rest: [1e-3, 1e-3],
+        over_meter: [5e-2, 2e-2],
+        over_radian: 5e-2,
+    };
+
+    /// Covariance over a motion, ordered (v, ω).
+    pub fn over(&self, motion: &Twist) -> Matrix6<f64> {
+        let distance_m = motion.linear.norm();
+        let angle_rad = motion.angular.norm();
+        let [rest_m, rest_rad] = self.at_rest.map(|deviation| deviation.powi(2));
+        let [meter_m, meter_rad] = self.over_meter.map(|deviation| deviation.powi(2));
+
+        let v = rest_m + meter_m * distance_m;
+        let w = rest_rad + meter_rad * distance_m + self.over_radian.powi(2) * angle_rad;
+        Matrix6::from_diagonal(&Vector6::new(v, v, v, w, w, w))
+    }
+}
+
+/// A parameter that no filter can have.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("{field} must be {expected}, but is {value}")]
+pub struct ParameterError {
+    /// The field, named as in [`FilterParameters`].
+    pub field: &'static str,
+    /// Its range.
+    pub expected: &'static str,
+    /// Its value.
+    pub value: f64,
+}
+
+impl FilterParameters {
+    /// Whether a robot may move so far in some seconds.
+    pub(super) fn is_possible(&self, motion: &Pose, seconds: f64) -> bool {
+        let Twist { linear, angular } = log(motion);
+        linear.norm() <= self.max_speed[0] * seconds
+            && angular.norm() <= self.max_speed[1] * seconds
+    }
+
+    /// The parameters with the default settings of a stream, as in a file.
+    #[must_use]
+    pub fn without_settings(self) -> Self {
+        let default = Self::default();
+        Self {
+            trust_wheels: default.trust_wheels,
+            keyframe_frames: default.keyframe_frames,
+            keyframe_displacement: default.keyframe_displacement,
+            fuse: default.fuse,
+            ..self
+        }
+    }
+
+    /// Checks that covariances computed with these parameters are positive definite.
+    ///
+    /// # Errors
+    /// [`ParameterError`] for the first parameter out of range.
+    pub fn check(&self) -> Result<(), ParameterError> {
+        let share = ("0 to 0.999", 0.0..=0.999);
+        let noise = ("0 to 1e9", 0.0..=1e9);
+        let positive = ("1e-9 to 1e9", 1e-9..=1e9);
+        for ((expected, range), numbers) in [
+            (share, self.shares()),
+            (noise, self.noises()),
+            (positive, self.positive_numbers()),
+        ] {
+            let is_wrong = |(_, value): &(_, f64)| !range.contains(value);
+            if let Some((field, value)) = numbers.into_iter().find(is_wrong) {
+                return Err(ParameterError {
+                    field,
+                    expected,
+                    value,
+                });
+            }
+        }
+        Ok(())
+    }
+
+    fn shares(&self) -> Vec<(&'static str, f64)> {
+        vec![
+            ("matched.correlated_share", self.matched.correlated_share),
+            (
+                "retrieved.correlated_share",
+                self.retrieved.correlated_share,
+            ),
+        ]
+    }
+
+    fn noises(&self) -> Vec<(&'static str, f64)> {
+        vec![
+            ("wheel_noise.over_meter[0]", self.wheel_noise.over_meter[0]),
+            ("wheel_noise.over_meter[1]", self.wheel_noise.over_meter[1]),
+            ("wheel_noise.over_radian", self.wheel_noise.over_radian),
+            (
+                "visual_noise.over_meter[0]",
+                self.visual_noise.over_meter[0],
+            ),
+            (
+                "visual_noise.over_meter[1]",
+                self.visual_noise.over_meter[1],
+            ),
+            ("visual_noise.over_radian", self.visual_noise.over_radian),
+        ]
+    }
+
+    fn positive_numbers(&self) -> Vec<(&'static str, f64)> {
+        let [range_m, range_rad] = self.correlation_range;
+        let [deviation_m, deviation_rad] = self.max_deviation;
+        let [speed_m_s, speed_rad_s] = self.max_speed;
+        vec![
+            (
+                "matched.views_to_agree",
+                f64::from(self.matched.views_to_agree),
+            ),
+            (
+                "retrieved.views_to_agree",
+                f64::from(self.retrieved.views_to_agree),
+            ),
+            ("correlation_range[0]", range_m),
+            ("correlation_range[1]", range_rad),
+            ("process_noise_factor", self.process_noise_factor),
+            ("gate", self.gate),
+            ("outlier_gate", self.outlier_gate),
+            ("max_candidate_s", self.max_candidate_s),
+            ("max_unlocated_s", self.max_unlocated_s),
+            ("gravity_gate", self.gravity_gate),
+            ("gravity_correlation_s", self.gravity_correlation_s),
+            ("max_deviation[0]", deviation_m),
+            ("max_deviation[1]", deviation_rad),
+            ("wheel_noise.at_rest[0]", self.wheel_noise.at_rest[0]),
+            ("wheel_noise.at_rest[1]", self.wheel_noise.at_rest[1]),
+            ("visual_noise.at_rest[0]", self.visual_noise.at_rest[0]),
+            ("visual_noise.at_rest[1]", self.visual_noise.at_rest[1]),
+            ("visual_design_effect", self.visual_design_effect),
+            ("visual_depth_time_s", self.visual_depth_time_s),
+            ("visual_scale_time_s", self.visual_scale_time_s),
+            ("disagreement_time_s", self.disagreement_time_s),
+            ("max_speed[0]", speed_m_s),
+            ("max_speed[1]", speed_rad_s),
+        ]
+    }
+}
