@@ -46,9 +46,8 @@ impl Disagreement {
         self.lasting *= kept;
     }
 
-    /// Adds the difference of one step. Returns the squared
-    /// length of the sum in standard deviations: χ² with as many degrees of freedom as axes are
-    /// compared, if both sensors are right.
+    /// Adds the difference of one step. Returns the squared length of the sum in standard deviations:
+    /// χ² with as many degrees of freedom as axes are compared, if both sensors are right.
     fn add(&mut self, difference: &TwistNoise) -> f64 {
         self.sum += difference.twist;
         self.variances += difference.variances;
