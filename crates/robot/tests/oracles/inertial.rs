@@ -520,3 +520,77 @@ fn the_predicted_covariance_is_that_of_the_differences() {
         assert!(off < 1e-2 * expected.norm(), "{axis}: {off}");
     }
 }
+
+/// Oracle: the contract of trusted wheels. Views that agree on a place 1 m away replace the pose that
+/// plain wheels carry, and only are a candidate beside trusted ones.
+#[test]
+fn views_do_not_replace_a_pose_that_trusted_wheels_carry() {
+    let there = Pose::translation(1.0, 0.0, 0.0);
+    for is_trusted in [false, true] {
+        let filter = filter(is_trusted);
+        let mut state = filter.start(None);
+        let mut last = None;
+
+        for number in 1..=60 {
+            let seen = if number <= 40 {
+                Pose::identity()
+            } else {
+                there
+            };
+            let observed = ViewObservation {
+                measured: Some(MeasuredPose {
+                    pose: Pose::identity(),
+                    drift: Drift {
+                        translation_share: 0.03,
+                        rotation_share: 0.03,
+                    },
+                    velocity_covariance: None,
+                }),
+                ..frame(number, Some(seen))
+            };
+            last = Some(filter.observe(&mut state, &observed).unwrap());
+        }
+
+        let update = last.unwrap();
+        let expected = if is_trusted { Pose::identity() } else { there };
+        let error = PoseError::between(&update.map_pose.unwrap().pose, &expected);
+        assert!(error.translation_m < 0.02, "{is_trusted}: {error:?}");
+        assert_eq!(update.candidate.is_some(), is_trusted);
+        assert_eq!(update.contradicted.contains(&Sensor::Views), is_trusted);
+    }
+}
+
+/// Oracle: the definition: over a time t, a velocity with the covariance Σ moves the camera with the
+/// covariance Σ t². The drift is negligible.
+#[test]
+fn a_covariance_of_velocities_is_that_of_the_motion() {
+    let filter = filter(false);
+    let deviations = [0.3, 0.2, 0.1, 0.03, 0.02, 0.01];
+    let velocity = nalgebra::Matrix6::from_diagonal(&Vector6::from(deviations).map(|x| x * x));
+    let mut state = filter.start(None);
+    let mut last = None;
+    for number in 1..=2 {
+        let observed = ViewObservation {
+            measured: Some(MeasuredPose {
+                pose: Pose::identity(),
+                drift: Drift {
+                    translation_share: 1e-4,
+                    rotation_share: 1e-4,
+                },
+                velocity_covariance: Some(velocity),
+            }),
+            ..frame(number, None)
+        };
+        last = Some(filter.observe(&mut state, &observed).unwrap());
+    }
+
+    let covariance = last.unwrap().motion_covariance;
+    for (axis, deviation) in deviations.into_iter().enumerate() {
+        let expected = deviation * PERIOD_S;
+        let found = covariance[(axis, axis)].sqrt();
+        assert!(
+            (found / expected - 1.0).abs() < 0.05,
+            "{axis}: {found} {expected}"
+        );
+    }
+}
