@@ -37,6 +37,7 @@ settle-api:
 lean:
     cargo check --no-default-features
     cargo check --features cloud
+    cargo check -p seese3-lab
 
 # Formatting, warnings, protos, deployment files.
 lint:

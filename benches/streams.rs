@@ -1,8 +1,11 @@
-//! How many cameras one machine follows: streams of 768-column features at a camera's rate over
-//! loopback, beside a server that answers the same messages without looking at them.
+//! How many cameras one machine follows over loopback. Clients and server share the machine.
 //!
-//! `cargo bench --bench streams -- [STREAMS] [HZ] [SECONDS]`; 1,000 at 10 Hz for 20 s if nothing is
-//! said. Clients and server share the machine.
+//! - `cargo bench --bench streams -- [STREAMS] [HZ] [SECONDS]`: streams of 768-column features, 1,000 at
+//!   10 Hz for 20 s by default, beside a server that answers the same messages without processing them.
+//! - `cargo bench --features full --bench streams -- [STREAMS] [HZ] [SECONDS] --images STORE ROOM FOLDER
+//!   MODEL`: streams of the images in FOLDER, 8 at 10 Hz for 20 s by default, in a room with keypoints
+//!   of the encoder MODEL; beside the encoder alone, on one image and on eight at a time. onnxruntime if
+//!   ORT_DYLIB_PATH names its library.
 #![allow(
     missing_docs,
     clippy::unwrap_used,
@@ -27,8 +30,9 @@ use seese3_core::geometry::{Pose, Twist, exp};
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
+use seese3_encoder::{Bounds, Encoder, Runtime, RuntimeKind, decode};
 use seese3_robot::calibration::calibrate;
-use seese3_server::{Config, run};
+use seese3_server::{Config, ImageEncoders, run};
 use seese3_store::Store;
 use tokio::net::TcpListener;
 use tokio_stream::{Stream, StreamExt, wrappers::ReceiverStream};
@@ -172,10 +176,14 @@ impl Held {
     }
 }
 
+/// The view of a frame, by stream and number.
+type Views = Arc<dyn Fn(usize, usize) -> pb::view::View + Send + Sync>;
+
 /// Follows `streams` cameras at `hz` for `seconds`; a frame's time runs from when it is due.
 async fn load(
     address: &str,
-    features: &Arc<Features>,
+    config: &pb::TrackConfig,
+    views: &Views,
     streams: usize,
     hz: f64,
     seconds: f64,
@@ -195,17 +203,12 @@ async fn load(
     let mut tasks = Vec::new();
     for stream in 0..streams {
         let client = clients[stream / SHARED].clone();
-        let features = features.clone();
+        let (config, views) = (config.clone(), views.clone());
 
         // Cameras are not in step.
         let first = begin + period.mul_f64(stream as f64 / streams as f64);
         tasks.push(tokio::spawn(async move {
             let (sender, requests) = tokio::sync::mpsc::channel(4);
-
-            let config = pb::TrackConfig {
-                room: "map".to_owned(),
-                ..pb::TrackConfig::default()
-            };
 
             sender
                 .send(pb::TrackRequest {
@@ -217,16 +220,11 @@ async fn load(
             tokio::spawn(async move {
                 for number in 0..count {
                     tokio::time::sleep_until((first + period * number as u32).into()).await;
-                    let row = (stream * 7 + number) % FRAMES;
-                    let feature = pb::Feature {
-                        values: features.rows().row(row).to_vec(),
-                        source_name: String::new(),
-                    };
                     let view = Some(pb::View {
-                        view: Some(pb::view::View::Feature(feature)),
+                        view: Some(views(stream, number)),
                     });
 
-                    let timestamp_ns = (number as i64 + 1) * 100_000_000;
+                    let timestamp_ns = ((number as f64 + 1.0) / hz * 1e9) as i64;
                     let sequence = number as u64 + 1;
                     let frame = pb::TrackFrame {
                         timestamp_ns,
@@ -278,15 +276,155 @@ async fn load(
     }
 }
 
+/// CPU time of this process, seconds.
+fn cpu_s() -> f64 {
+    let stat = std::fs::read_to_string("/proc/self/stat").unwrap();
+    let numbers = stat.rsplit(") ").next().unwrap().split(' ');
+    let ticks: f64 = numbers
+        .skip(11)
+        .take(2)
+        .map(|n| n.parse::<f64>().unwrap())
+        .sum();
+    // Linux counts 100 ticks a second.
+    ticks / 100.0
+}
+
+/// Starts a server of a store, and waits until it answers.
+async fn serve(store: Store, config: Config) -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    tokio::spawn(run(listener, store, config, std::future::pending()));
+
+    let ready = Client::connect(&address, Duration::from_secs(60))
+        .await
+        .unwrap();
+    while ready.rooms().await.is_err() {
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    address
+}
+
+/// Streams of images, beside the encoder alone.
+async fn images([streams, hz, seconds]: [f64; 3], [store, room, folder, model]: [&str; 4]) {
+    let mut files: Vec<_> = std::fs::read_dir(folder)
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| {
+            path.extension()
+                .is_some_and(|ext| ext == "jpg" || ext == "png")
+        })
+        .collect();
+    files.sort();
+    let files: Vec<Vec<u8>> = files
+        .iter()
+        .map(|file| std::fs::read(file).unwrap())
+        .collect();
+
+    let library = std::env::var_os("ORT_DYLIB_PATH").map(std::path::PathBuf::from);
+    let kind = match library {
+        Some(_) => RuntimeKind::OnnxRuntime,
+        None => RuntimeKind::Tract,
+    };
+    let runtime = Runtime {
+        kind,
+        threads: 1,
+        library,
+    };
+    let encoders = ImageEncoders {
+        models: vec![model.to_owned()],
+        runtime: runtime.clone(),
+        bounds: Bounds::LOCAL,
+    };
+
+    let store = Store::open(store).unwrap();
+    let stored = store.load_room(room, None).await.unwrap();
+    let source = &stored
+        .keypoints
+        .as_ref()
+        .expect("a room with keypoints")
+        .source;
+    let encoder = Encoder::of_keypoints(source, &encoders.models, &runtime)
+        .unwrap()
+        .expect("the encoder of the room's keypoints");
+    let some = &files[..files.len().min(200)];
+    for batch in [1, 8] {
+        let mut latencies_ms = Vec::new();
+        let begin = cpu_s();
+        for files in some.chunks_exact(batch) {
+            let began = Instant::now();
+            let prepared: Vec<_> = files
+                .iter()
+                .map(|file| decode("image", file, Bounds::LOCAL).unwrap())
+                .map(|image| encoder.prepare(image).unwrap())
+                .collect();
+            let clips: Vec<_> = prepared.iter().map(|image| vec![image]).collect();
+            encoder.encode_frames(&clips).unwrap();
+            latencies_ms.push(began.elapsed().as_secs_f64() * 1e3);
+        }
+        latencies_ms.sort_by(f64::total_cmp);
+        let count = latencies_ms.len();
+        println!(
+            "encoder alone, {batch} at a time: {:.1} ms of CPU an image; p50 {:.2} ms, p99 {:.2} ms a batch",
+            (cpu_s() - begin) * 1e3 / (count * batch) as f64,
+            latencies_ms[count / 2],
+            latencies_ms[(count - 1) * 99 / 100],
+        );
+    }
+
+    let config = Config {
+        encoders: Some(encoders),
+        ..Config::default()
+    };
+    let address = serve(store, config).await;
+    let config = pb::TrackConfig {
+        room: room.to_owned(),
+        mapping_camera: true,
+        token_every: Some(1000),
+        ..pb::TrackConfig::default()
+    };
+    let files = Arc::new(files);
+    // Each stream begins elsewhere, and turns back at the ends.
+    let views: Views = Arc::new(move |stream, number| {
+        let period = 2 * files.len() - 2;
+        let at = (stream * 40 + number) % period;
+        pb::view::View::Image(files[at.min(period - at)].clone())
+    });
+    // The first load is not counted: the room is loaded, and caches are warm.
+    load(&address, &config, &views, 1, 10.0, 3.0).await;
+    for (streams, hz) in [(1.0, hz), (streams, hz)] {
+        let begin = cpu_s();
+        let held = load(&address, &config, &views, streams as usize, hz, seconds).await;
+        let cpu_ms = (cpu_s() - begin) * 1e3 / held.answered as f64;
+        println!(
+            "{} ({cpu_ms:.1} ms of CPU an image, with its client)",
+            held.line(&format!("{streams} streams at {hz} Hz"))
+        );
+    }
+}
+
 #[tokio::main]
 async fn main() {
-    let given: Vec<f64> = std::env::args()
+    let words: Vec<String> = std::env::args().skip(1).collect();
+    let given: Vec<f64> = words.iter().map_while(|word| word.parse().ok()).collect();
+    let of = |usual: f64| {
+        let usual = [usual, 10.0, 20.0];
+        [0, 1, 2].map(|at| *given.get(at).unwrap_or(&usual[at]))
+    };
+    let paths: Vec<&str> = words
+        .iter()
+        .skip_while(|word| *word != "--images")
         .skip(1)
-        .filter_map(|word| word.parse().ok())
+        .take(4)
+        .map(String::as_str)
         .collect();
-    let [streams, hz, seconds] =
-        [(0, 1_000.0), (1, 10.0), (2, 20.0)].map(|(at, plain)| *given.get(at).unwrap_or(&plain));
+    match paths[..] {
+        [store, room, folder, model] => images(of(8.0), [store, room, folder, model]).await,
+        _ => features(of(1_000.0)).await,
+    }
+}
 
+/// Streams of features, beside a server that only answers.
+async fn features([streams, hz, seconds]: [f64; 3]) {
     let rooms: Vec<(Room, Features)> = [("map", 1), ("second", 2), ("third", 3)]
         .map(|(name, seed)| room(name, seed))
         .into();
@@ -304,23 +442,19 @@ async fn main() {
         .await
         .unwrap();
 
-    let features = Arc::new(rooms[0].1.clone());
-    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-    let address = listener.local_addr().unwrap().to_string();
-
-    tokio::spawn(run(
-        listener,
-        store,
-        Config::default(),
-        std::future::pending(),
-    ));
-
-    let ready = Client::connect(&address, Duration::from_secs(20))
-        .await
-        .unwrap();
-    while ready.rooms().await.is_err() {
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
+    let address = serve(store, Config::default()).await;
+    let features = rooms[0].1.clone();
+    let views: Views = Arc::new(move |stream, number| {
+        let row = (stream * 7 + number) % FRAMES;
+        pb::view::View::Feature(pb::Feature {
+            values: features.rows().row(row).to_vec(),
+            source_name: String::new(),
+        })
+    });
+    let config = pb::TrackConfig {
+        room: "map".to_owned(),
+        ..pb::TrackConfig::default()
+    };
 
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let echo = listener.local_addr().unwrap().to_string();
@@ -336,8 +470,8 @@ async fn main() {
         "{streams} streams at {hz} Hz for {seconds} s, {COLUMNS} columns, room of {FRAMES} frames"
     );
 
-    let peer = load(&echo, &features, streams as usize, hz, seconds).await;
+    let peer = load(&echo, &config, &views, streams as usize, hz, seconds).await;
     println!("{}", peer.line("echo "));
-    let ours = load(&address, &features, streams as usize, hz, seconds).await;
+    let ours = load(&address, &config, &views, streams as usize, hz, seconds).await;
     println!("{}", ours.line("track"));
 }

@@ -2,11 +2,15 @@
 
     seese3 export numpy --store STORE --room ROOM --out FOLDER
     python two_view_sift.py FOLDER --stride 10 [--width 320] [--focal WIDTHS] [--every N]
+    python two_view_sift.py FOLDER --stride 9 --drift [--sequence 1]
 
 Reads the pairs that `seese3 evaluate motion --stride 10` reads, or every N-th of them, and prints the same errors: medians and
 90 % quantiles in metres and degrees. SIFT (2,000 features, ratio test at 0.8) and MAGSAC with a threshold
 of one pixel in 640; a pair with fewer than 8 matches or inliers counts as no motion. An essential matrix
 has no scale: the true length of the translation is given to it. Needs numpy and opencv-python-headless.
+
+With --drift it composes the motions of successive pairs of a sequence, and prints the mean drift of the path as
+`seese3 evaluate odometry` does: over parts of 0.5, 1, 2 and 4 m, per meter.
 """
 
 import argparse
@@ -51,6 +55,20 @@ def read(first, second, camera, width, true_length):
     return motion
 
 
+def drift(truth, estimated):
+    """Mean errors of the position, percent, and of the rotation, degrees per meter, over parts of a path."""
+    steps = [np.linalg.norm(b[:3, 3] - a[:3, 3]) for a, b in zip(truth, truth[1:])]
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    errors = []
+    for start in range(len(truth)):
+        for length in (0.5, 1.0, 2.0, 4.0):
+            end = int(np.searchsorted(way, way[start] + length))
+            if end < len(truth):
+                off = relative(relative(estimated[start], estimated[end]), relative(truth[start], truth[end]))
+                errors.append(np.array([100 * np.linalg.norm(off[:3, 3]), angle(off[:3, :3])]) / (way[end] - way[start]))
+    return np.mean(errors, axis=0)
+
+
 def main():
     options = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     options.add_argument("folder", type=pathlib.Path)
@@ -58,6 +76,8 @@ def main():
     options.add_argument("--width", type=int, default=0, help="resize images to this width")
     options.add_argument("--focal", type=float, help="focal length in image widths")
     options.add_argument("--every", type=int, default=1, help="read every so many pairs")
+    options.add_argument("--drift", action="store_true", help="compose the motions of successive pairs")
+    options.add_argument("--sequence", type=int, default=0, help="the sequence of --drift")
     given = options.parse_args()
 
     bundle = json.loads((given.folder / "bundle.json").read_text())
@@ -86,7 +106,12 @@ def main():
         return found[row]
 
     errors, still, failed = [], [], 0
-    for row in range(0, len(poses) - given.stride, given.every):
+    rows = range(0, len(poses) - given.stride, given.every)
+    if given.drift:
+        rows = range(sequences.index(given.sequence), len(poses) - given.stride, given.stride)
+        rows = [row for row in rows if sequences[row] == given.sequence]
+    path = [np.eye(4)]
+    for row in rows:
         if sequences[row] != sequences[row + given.stride]:
             continue
         truth = relative(poses[row], poses[row + given.stride])
@@ -97,11 +122,17 @@ def main():
         camera = np.array([[fx * width, 0, x], [0, fy * width, y], [0, 0, 1.0]])
         motion = read(first, second, camera, width, np.linalg.norm(truth[:3, 3]))
         failed += motion is None
+        path.append(path[-1] @ (np.eye(4) if motion is None else motion))
         off = relative(np.eye(4) if motion is None else motion, truth)
         errors.append((np.linalg.norm(off[:3, 3]), angle(off[:3, :3])))
         still.append((np.linalg.norm(truth[:3, 3]), angle(truth[:3, :3])))
 
     print(f"{len(errors)} pairs, {failed} without an answer")
+    if given.drift:
+        truth = [poses[rows[0] + given.stride * step] for step in range(len(path))]
+        percent, degrees = drift(truth, path)
+        print(f"SIFT, with the true lengths: drift {percent:.1f} %, {degrees:.2f} degrees per meter")
+        return
     print("motion by                          median m  90 % m  median °  90 % °")
     for name, rows in (("SIFT, with the true length", errors), ("no motion", still)):
         metres, degrees = np.array(rows).T

@@ -60,6 +60,7 @@ from .errors import (
 from .newest import AsyncNewest, Newest
 from .program import Server, run, serve
 from .requests import (
+    DepthImage,
     Gravity,
     InertialSamples,
     InertialSensor,
@@ -90,6 +91,7 @@ __all__ = [
     "DamagedError",
     "DeadlineError",
     "Default",
+    "DepthImage",
     "Encoding",
     "Evaluation",
     "Feature",

@@ -15,7 +15,17 @@ import numpy.typing as npt
 from . import answers, channel, errors, requests
 from .answers import Adapter, Camera, Default, Evaluation, Publication, Room, TrackRefusal, TrackStart, TrackUpdate
 from .geometry import wire_pose
-from .requests import Gravity, InertialSamples, InitialPose, Odometry, Prediction, Question, TrackConfig, Upload
+from .requests import (
+    DepthImage,
+    Gravity,
+    InertialSamples,
+    InitialPose,
+    Odometry,
+    Prediction,
+    Question,
+    TrackConfig,
+    Upload,
+)
 from .v1 import (
     catalog_pb2,
     catalog_pb2_grpc,
@@ -699,15 +709,16 @@ class AsyncTrack:
         other_views: dict[str, View] | None = None,
         inertial: InertialSamples | None = None,
         exposure_ns: int = 0,
+        depth: DepthImage | None = None,
     ) -> TrackUpdate | TrackRefusal:
         """Sends a frame, taken at a time on the camera's clock, and returns what the server says of it.
 
         `inertial` are the samples since the last frame. `exposure_ns` is the duration of the exposure, which begins at
-        the time.
+        the time. `depth` are the depths of an image, from a depth camera or stereo.
 
         A step that raises, or that is given up, did not happen: the frame may be sent again.
         """
-        frame = self._frame(view, timestamp_ns, sequence, odometry, gravity, other_views, inertial, exposure_ns)
+        frame = self._frame(view, timestamp_ns, sequence, odometry, gravity, other_views, inertial, exposure_ns, depth)
         return _answered(await self._exchange(frame))
 
     async def follow(
@@ -791,10 +802,11 @@ class AsyncTrack:
         other_views: dict[str, View] | None = None,
         inertial: InertialSamples | None = None,
         exposure_ns: int = 0,
+        depth: DepthImage | None = None,
     ) -> odometry_pb2.TrackRequest:
         number = self.last_sequence + 1 if sequence is None else sequence
         frame = requests.track_frame(
-            view, timestamp_ns, number, odometry, gravity, other_views or {}, inertial, exposure_ns
+            view, timestamp_ns, number, odometry, gravity, other_views or {}, inertial, exposure_ns, depth
         )
         self.last_sequence = number
         return frame

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import struct
 import uuid
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -160,11 +162,15 @@ class InitialPose:
 
 @dataclass(frozen=True, eq=False)
 class RigCamera:
-    """Another camera on the robot: its name, its pose (4, 4) on the base, and its intrinsics if they are known."""
+    """Another camera on the robot: its name, its pose (4, 4) on the base, and its intrinsics if they are known.
+
+    `time_offset_ns` is the time from the middle of the exposure of the stream's own view to that of this camera's view.
+    """
 
     name: str
     pose: npt.ArrayLike
     camera: Camera | None = None
+    time_offset_ns: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +261,12 @@ class TrackConfig:
                 displacement=self.keyframe_displacement, frames=self.keyframe_frames
             )
         others = [
-            odometry_pb2.RigCamera(name=other.name, pose=wire_pose(other.pose), camera=wire_camera(other.camera))
+            odometry_pb2.RigCamera(
+                name=other.name,
+                pose=wire_pose(other.pose),
+                camera=wire_camera(other.camera),
+                time_offset_ns=other.time_offset_ns,
+            )
             for other in self.other_cameras
         ]
         camera = wire_view_camera(self.camera)
@@ -304,6 +315,43 @@ class Gravity:
     deviation_rad: float | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """Depths (h, w) of an image along its optical axis, in meters; those that are not finite, or 0, are unknown.
+
+    They are registered to the image: the same optical center, lens, orientation and aspect ratio. `deviation_m` is the
+    standard deviation of a depth of 1 m; that of a depth z is z² times it. For stereo it is that of the disparity in
+    pixels, over the focal length in pixels and the baseline in meters.
+    """
+
+    depths: npt.ArrayLike
+    deviation_m: float | None = None
+
+    def message(self) -> odometry_pb2.DepthImage:
+        depths = real(self.depths, "depth.depths")
+        if depths.ndim != 2 or 0 in depths.shape:
+            raise ValueError(f"depth.depths: is {depths.shape}, not (height, width)")
+        millimeters = np.nan_to_num(np.round(depths * 1000), nan=0, posinf=0, neginf=0)
+        millimeters[(millimeters < 0) | (millimeters > np.iinfo(np.uint16).max)] = 0
+        return odometry_pb2.DepthImage(png=gray16_png(millimeters.astype(np.uint16)), deviation_m=self.deviation_m)
+
+
+def gray16_png(values: npt.NDArray[np.uint16]) -> bytes:
+    """A PNG of 16-bit gray values (h, w)."""
+    height, width = values.shape
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        check = zlib.crc32(kind + data)
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", check)
+
+    # Each row begins with the number of its filter, 0 for none.
+    rows = np.zeros((height, 1 + 2 * width), np.uint8)
+    rows[:, 1:] = values.astype(">u2").view(np.uint8).reshape(height, 2 * width)
+    header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
+    pixels = zlib.compress(rows.tobytes(), 1)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+
+
 def track_frame(
     view: View,
     timestamp_ns: int,
@@ -313,6 +361,7 @@ def track_frame(
     other_views: dict[str, View],
     inertial: InertialSamples | None,
     exposure_ns: int,
+    depth: DepthImage | None,
 ) -> odometry_pb2.TrackRequest:
     """A frame of a tracking stream."""
     measured = None
@@ -343,6 +392,7 @@ def track_frame(
             other_views=others,
             inertial_samples=inertial.messages() if inertial else None,
             exposure_ns=exposure_ns,
+            depth=depth.message() if depth else None,
         )
     )
 

@@ -1,10 +1,13 @@
 """Poses and views on the wire."""
 
+import struct
+import zlib
+
 import numpy as np
 import pytest
 from seese3.answers import Camera
 from seese3.geometry import pose_matrix, wire_pose, wire_twist
-from seese3.requests import wire_camera
+from seese3.requests import DepthImage, wire_camera
 from seese3.v1 import geometry_pb2 as pb
 from seese3.views import Feature, wire_view
 
@@ -46,6 +49,19 @@ def test_a_feature_packed_by_its_bytes_is_the_message_that_protobuf_makes(column
     expected = pb.View(feature=pb.Feature(values=row.tolist(), source_name="größe"))
     assert wire_view(Feature(row, "größe")) == expected
     assert wire_view(row.astype(np.float64)).feature.values == expected.feature.values
+
+
+def test_depths_are_a_png_of_millimeters() -> None:
+    """By the definition of PNG: the header, and rows of big-endian values behind the number of their filter."""
+    depths = np.array([[0.0, 1.5], [np.nan, 65.535], [-1.0, 70.0]])
+    message = DepthImage(depths, 0.01).message()
+    assert message.deviation_m == 0.01 and message.png[:8] == b"\x89PNG\r\n\x1a\n"
+    assert message.png[12:29] == b"IHDR" + struct.pack(">IIBBBBB", 2, 3, 16, 0, 0, 0, 0)
+    begins = message.png.index(b"IDAT") + 4
+    rows = zlib.decompress(message.png[begins:])
+    assert rows == struct.pack(">" + 3 * "BHH", 0, 0, 1500, 0, 0, 65_535, 0, 0, 0)
+    with pytest.raises(ValueError, match="depth.depths"):
+        DepthImage([1.0, 2.0]).message()
 
 
 def test_a_view_that_is_nothing_of_the_kind_is_refused() -> None:

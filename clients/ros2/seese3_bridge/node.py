@@ -30,7 +30,8 @@ TOGETHER_NS = 20_000_000
 KEEPALIVE = [("grpc.keepalive_time_ms", 20_000), ("grpc.keepalive_timeout_ms", 10_000)]
 PARAMETERS = {"server": "127.0.0.1:50051", "room": "", "adapter": "", "camera_frame": "camera_optical_frame",
               "base_frame": "base_link", "publish_tf": False, "use_camera_info": False, "wheel_drift": 0.05,
-              "use_wheel_covariance": False, "trust_odometry": False, "inertial": False}
+              "use_wheel_covariance": False, "trust_odometry": False, "inertial": False, "depth": False,
+              "depth_deviation": 0.005}
 
 
 class Bridge(Node):
@@ -43,9 +44,10 @@ class Bridge(Node):
         # The last of each sensor, with its stamp.
         self.wheels = self.gravity = None
         self.beside, self.gravity_of = {}, requests.Gravity()
+        self.depth = None
         # Samples of the inertial sensor since the last frame.
         self.samples, self.last_sample_ns = collections.deque(maxlen=SAMPLES), 0
-        # A frame that waits for the images of the other cameras.
+        # A frame that waits for its depths and the images of the other cameras.
         self.waiting, self.has_failed = None, False
         self.begins = threading.Event()
         if not self.given["use_camera_info"]:
@@ -96,6 +98,9 @@ class Bridge(Node):
             self.create_subscription(CompressedImage, f"~/{other.name}/image", functools.partial(callback, compressed), sensor)
             self.create_subscription(Image, f"~/{other.name}/image_raw", functools.partial(callback, raw), sensor)
 
+        if self.given["depth"]:
+            self.create_subscription(Image, "~/depth", self.on_depth, sensor)
+
         self.create_subscription(PoseWithCovarianceStamped, "/initialpose", self.on_initial_pose, 10)
         if self.given["use_camera_info"]:
             self.create_subscription(CameraInfo, "~/camera_info", self.on_camera_info, sensor)
@@ -135,14 +140,32 @@ class Bridge(Node):
         if has_gravity and self.gravity is not None and abs(self.gravity[0] - stamp) <= OLD_NS:
             frame.gravity.CopyFrom(self.gravity[1])
         self.waiting = frame
-        if len(self.views_beside(stamp)) == len(self.config.other_cameras):
-            self.send_waiting()
+        self.send_complete()
 
     def on_other_image(self, name, reader, image):
         if (view := self.view_of(reader, image)) is None:
             return
         self.beside[name] = requests.nanoseconds(image.header.stamp), view
-        if self.waiting and len(self.views_beside(self.waiting.timestamp_ns)) == len(self.config.other_cameras):
+        self.send_complete()
+
+    def on_depth(self, image):
+        reader = functools.partial(requests.depth_image, deviation_m=self.given["depth_deviation"])
+        if (depth := self.view_of(reader, image)) is not None:
+            self.depth = requests.nanoseconds(image.header.stamp), depth
+            self.send_complete()
+
+    def depth_at(self, stamp):
+        """The depths of an image taken at a time, or None."""
+        is_of_image = self.depth is not None and abs(self.depth[0] - stamp) <= TOGETHER_NS
+        return self.depth[1] if is_of_image else None
+
+    def send_complete(self):
+        """Sends the frame that waits if nothing is missing."""
+        if self.waiting is None:
+            return
+        stamp = self.waiting.timestamp_ns
+        has_views = len(self.views_beside(stamp)) == len(self.config.other_cameras)
+        if has_views and (not self.given["depth"] or self.depth_at(stamp) is not None):
             self.send_waiting()
 
     def views_beside(self, stamp):
@@ -150,11 +173,13 @@ class Bridge(Node):
         return {name: view for name, (other, view) in self.beside.items() if abs(other - stamp) <= TOGETHER_NS}
 
     def send_waiting(self):
-        """Sends the frame that waits for other cameras, with what they have brought: when all have, or at the next image."""
+        """Sends the frame that waits for depths and other cameras, with what has come: when all have, or at the next image."""
         if self.waiting is None:
             return
         for name, view in self.views_beside(self.waiting.timestamp_ns).items():
             self.waiting.other_views.add(camera=name, view=view)
+        if (depth := self.depth_at(self.waiting.timestamp_ns)) is not None:
+            self.waiting.depth.CopyFrom(depth)
         self.offer(odometry_pb2.TrackRequest(frame=self.waiting))
         self.waiting = None
 

@@ -3,12 +3,15 @@
 import io
 import math
 
+import numpy
 from PIL import Image as Picture
 from seese3.v1 import geometry_pb2, odometry_pb2
 
 # Encodings of sensor_msgs/Image, as Pillow names the modes of the picture and of its bytes.
 ENCODINGS = {"rgb8": ("RGB", "RGB"), "bgr8": ("RGB", "BGR"), "rgba8": ("RGB", "RGBX"), "bgra8": ("RGB", "BGRX"),
              "mono8": ("L", "L"), "8UC1": ("L", "L"), "8UC3": ("RGB", "BGR")}
+# Encodings of depths: the type of a value, and the depth of the value 1, meters.
+DEPTHS = {"16UC1": ("u2", 0.001), "32FC1": ("f4", 1.0)}
 # The server's limits of angular velocities and accelerations, rad/s and m/s².
 MOST = 100.0, 1_000.0
 # The acceleration of a robot that drives is averaged over this time for the direction of gravity, seconds.
@@ -38,6 +41,27 @@ def view_of_raw(image):
     encoded = io.BytesIO()
     picture.save(encoded, "PNG", compress_level=1)
     return geometry_pb2.View(image=encoded.getvalue())
+
+
+def depth_image(image, deviation_m):
+    """The depths of a sensor_msgs/Image that is registered to the camera: millimeters in 16UC1, or meters in 32FC1 (REP-118).
+
+    Raises ValueError for another encoding, and for data that are too short."""
+    if image.encoding not in DEPTHS:
+        raise ValueError(f"encoding '{image.encoding}' of depths is none of: {', '.join(DEPTHS)}")
+    kind, unit_m = DEPTHS[image.encoding]
+    kind = numpy.dtype(kind).newbyteorder(">" if image.is_bigendian else "<")
+    row = image.width * kind.itemsize
+    if image.height == 0 or row == 0 or image.step < row or image.height * image.step > len(image.data):
+        raise ValueError(f"{len(image.data)} bytes are no depths of {image.height} rows of {image.step} bytes")
+
+    rows = numpy.frombuffer(bytes(image.data), numpy.uint8)[:image.height * image.step].reshape(image.height, image.step)
+    values = numpy.ascontiguousarray(rows[:, :row]).view(kind)
+    millimeters = numpy.nan_to_num(numpy.round(values * (unit_m * 1000.0)), nan=0, posinf=0, neginf=0)
+    millimeters[(millimeters < 0) | (millimeters > 65_535)] = 0
+    encoded = io.BytesIO()
+    Picture.fromarray(millimeters.astype(numpy.uint16)).save(encoded, "PNG", compress_level=1)
+    return odometry_pb2.DepthImage(png=encoded.getvalue(), deviation_m=deviation_m)
 
 
 def wire_pose(pose, parent, child):

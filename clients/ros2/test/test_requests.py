@@ -2,6 +2,7 @@
 
 import io
 import math
+import struct
 
 import pytest
 import stand_in
@@ -42,6 +43,33 @@ def test_raw_images_keep_their_colours_and_lose_their_padding(encoding, bytes_of
 def test_what_is_no_image_is_said(message, says):
     with pytest.raises(ValueError, match=says):
         requests.view_of_raw(message)
+
+
+def depths(message):
+    found = requests.depth_image(message, 0.01)
+    picture = Picture.open(io.BytesIO(found.png))
+    return found.deviation_m, picture.size, [picture.getpixel((x, y)) for y in range(2) for x in range(2)]
+
+
+def test_depths_are_millimeters_and_unknown_ones_are_zero():
+    padding = b"\x99\x99"
+    of_16 = [struct.pack("<2H", 0, 1500) + padding, struct.pack("<2H", 65_535, 7) + padding]
+    assert depths(raw("16UC1", of_16, 6)) == (0.01, (2, 2), [0, 1500, 65_535, 7])
+    of_32 = [struct.pack("<2f", math.nan, 1.5), struct.pack("<2f", math.inf, 70.0)]
+    assert depths(raw("32FC1", of_32, 8)) == (0.01, (2, 2), [0, 1500, 0, 0])
+    big = raw("16UC1", [struct.pack(">2H", 0, 1500)] * 2, 4)
+    big.is_bigendian = 1
+    assert depths(big)[2] == [0, 1500, 0, 1500]
+
+
+@pytest.mark.parametrize(("message", "says"), [
+    (raw("mono8", [b"\x00\x00"], 2), "mono8"),
+    (raw("16UC1", [b"\x00" * 4], 3), "4 bytes are no depths"),
+    (raw("32FC1", [b"\x00" * 4], 8), "4 bytes are no depths"),
+])
+def test_what_is_no_depth_is_said(message, says):
+    with pytest.raises(ValueError, match=says):
+        requests.depth_image(message, 0.01)
 
 
 def test_a_camera_that_is_not_calibrated_is_none():

@@ -19,7 +19,6 @@ use image::{
 };
 
 use super::Error;
-use seese3_core::Cause;
 use seese3_core::image::RgbImage;
 
 /// Limits on the size of an image.
@@ -61,36 +60,75 @@ impl Bounds {
 /// [`Error::BadImage`] if the format is not JPEG or PNG, the file is incomplete or damaged, or the
 /// image exceeds `bounds`.
 pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Error> {
-    // Messages of the decoders may contain line breaks; our errors are one line.
-    let one_line = |problem: Cause| {
-        problem
-            .to_string()
-            .split_whitespace()
-            .collect::<Vec<_>>()
-            .join(" ")
+    let decoded = match image::guess_format(bytes).ok() {
+        Some(ImageFormat::Jpeg) => {
+            check_bytes(bytes, bounds).and_then(|()| decode_jpeg(bytes, bounds))
+        }
+        Some(ImageFormat::Png) => decode_png(bytes, bounds)
+            .map(|(decoded, orientation)| upright(decoded.into_rgb8(), orientation)),
+        _ => check_bytes(bytes, bounds).and(Err("is neither JPEG nor PNG".to_owned())),
     };
-    let bad = |problem: Cause| Error::BadImage {
+    decoded.map_err(|problem| bad_image(name, &problem))
+}
+
+/// 16-bit gray values, row by row.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct GrayImage16 {
+    /// Pixels of a row.
+    pub width: usize,
+    /// Number of rows.
+    pub height: usize,
+    /// The values.
+    pub values: Vec<u16>,
+}
+
+/// Decodes a PNG of 16-bit gray values. `name` identifies the image in error messages.
+///
+/// # Errors
+/// [`Error::BadImage`] if it is no such PNG, is incomplete or damaged, or exceeds `bounds`.
+pub fn decode_gray16(name: &str, bytes: &[u8], bounds: Bounds) -> Result<GrayImage16, Error> {
+    let decoded = match image::guess_format(bytes).ok() {
+        Some(ImageFormat::Png) => decode_png(bytes, bounds),
+        _ => Err("is not a PNG".to_owned()),
+    };
+    match decoded {
+        Ok((DynamicImage::ImageLuma16(image), _)) => Ok(GrayImage16 {
+            width: image.width() as usize,
+            height: image.height() as usize,
+            values: image.into_raw(),
+        }),
+        Ok((other, _)) => {
+            let problem = format!(
+                "has pixels of the type {:?}, not 16-bit gray",
+                other.color()
+            );
+            Err(bad_image(name, &problem))
+        }
+        Err(problem) => Err(bad_image(name, &problem)),
+    }
+}
+
+/// Messages of the decoders may contain line breaks; our errors are one line.
+fn bad_image(name: &str, problem: &str) -> Error {
+    let words: Vec<&str> = problem.split_whitespace().collect();
+    Error::BadImage {
         image: name.to_owned(),
-        problem: one_line(problem).into(),
-    };
-
-    if bytes.len() as u64 > bounds.bytes {
-        return Err(bad(format!(
-            "is {} bytes, over the limit of {}",
-            bytes.len(),
-            bounds.bytes
-        )
-        .into()));
+        problem: words.join(" ").into(),
     }
+}
 
-    let format = image::guess_format(bytes).ok();
-    if !matches!(format, Some(ImageFormat::Jpeg | ImageFormat::Png)) {
-        return Err(bad("is neither JPEG nor PNG".into()));
-    }
-    if format == Some(ImageFormat::Jpeg) {
-        return decode_jpeg(bytes, bounds).map_err(|problem| bad(problem.into()));
-    }
+fn check_bytes(bytes: &[u8], bounds: Bounds) -> Result<(), String> {
+    let count = bytes.len() as u64;
+    let most = bounds.bytes;
+    (count <= most)
+        .then_some(())
+        .ok_or_else(|| format!("is {count} bytes, over the limit of {most}"))
+}
 
+/// The pixels and the EXIF orientation of a PNG.
+fn decode_png(bytes: &[u8], bounds: Bounds) -> Result<(DynamicImage, Orientation), String> {
+    check_bytes(bytes, bounds)?;
+    let problem = |error: image::ImageError| error.to_string();
     let read = |most: u64| {
         let mut reader = ImageReader::new(Cursor::new(bytes));
         reader.set_format(ImageFormat::Png);
@@ -103,22 +141,17 @@ pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Erro
 
     // The header is read alone first, so that an image over the limits is refused before memory is
     // allocated for its pixels.
-    let (width, height) = read(HEADER_ALLOC)
-        .into_dimensions()
-        .map_err(|error| bad(error.into()))?;
-    check_size(width as usize, height as usize, bounds).map_err(|problem| bad(problem.into()))?;
+    let (width, height) = read(HEADER_ALLOC).into_dimensions().map_err(problem)?;
+    check_size(width as usize, height as usize, bounds)?;
 
     // A pixel has at most four channels of 16 bits, 8 bytes; the decoder may use as much again.
     let most = (u64::from(width) * u64::from(height))
         .saturating_mul(16)
         .saturating_add(HEADER_ALLOC);
-    let mut decoder = read(most)
-        .into_decoder()
-        .map_err(|error| bad(error.into()))?;
+    let mut decoder = read(most).into_decoder().map_err(problem)?;
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-    let decoded = DynamicImage::from_decoder(decoder).map_err(|error| bad(error.into()))?;
-
-    Ok(upright(decoded.into_rgb8(), orientation))
+    let decoded = DynamicImage::from_decoder(decoder).map_err(problem)?;
+    Ok((decoded, orientation))
 }
 
 /// Applies an EXIF orientation to an image.

@@ -41,6 +41,11 @@ impl ImageEncoder {
         }
     }
 
+    /// The limits on an image.
+    pub fn bounds(&self) -> Bounds {
+        self.bounds
+    }
+
     /// Records the encoding time of each image in `metrics`.
     pub fn counted_in(self, metrics: Metrics) -> Self {
         Self {

@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::player::{PlayedView, Player, Reader, Sensed, Sight, ViewInput};
-use super::simulated_sensors::wheels;
+use super::simulated_sensors::{has_depths, wheels};
 use super::tracking_scores::Drift;
 use seese3_core::geometry::{Pose, PoseError};
 use seese3_robot::matched_views::ViewKeypoints;
@@ -21,6 +21,8 @@ pub struct MaplessDrift {
     pub images: Drift,
     /// The same, scaled to the true length of the first part.
     pub images_true_length: Drift,
+    /// By images with simulated depths.
+    pub depths: Drift,
     /// By images and simulated wheels.
     pub wheels: Drift,
     /// By the wheels alone.
@@ -36,10 +38,11 @@ struct Paths {
 }
 
 impl MaplessDrift {
-    /// Plays all streams of a room without its map.
+    /// Plays all streams of a room without its map; `depths` are simulated depths of their views.
     pub(super) fn of<'a>(
         streams: &[&[PlayedView<'a>]],
         player: &dyn Fn(Option<Pose>) -> Player<'a>,
+        depths: &[Vec<Sensed>],
     ) -> Self {
         let truth = |views: &[PlayedView<'_>]| views.iter().map(|view| view.truth).collect();
         let played = |views: &[PlayedView<'a>], sensed: &[Sensed]| {
@@ -60,6 +63,12 @@ impl MaplessDrift {
             .map(|views| played(views, &vec![Sensed::default(); views.len()]))
             .collect();
         let scaled = images.iter().zip(streams);
+        let with_depths: Vec<Paths> = if has_depths(streams, depths) {
+            let both = all.clone().zip(depths);
+            both.map(|(views, depths)| played(views, depths)).collect()
+        } else {
+            Vec::new()
+        };
         let with_wheels = all
             .clone()
             .enumerate()
@@ -79,6 +88,7 @@ impl MaplessDrift {
                     .map(|(paths, views)| paths.with_true_length(views))
                     .collect::<Vec<_>>(),
             ),
+            depths: drift(&with_depths),
             wheels: drift(&with_wheels.collect::<Vec<_>>()),
             wheels_alone: drift(&alone.collect::<Vec<_>>()),
             two_view_true_lengths: drift(
@@ -94,6 +104,7 @@ impl MaplessDrift {
         Self {
             images: of(|drifts| &drifts.images),
             images_true_length: of(|drifts| &drifts.images_true_length),
+            depths: of(|drifts| &drifts.depths),
             wheels: of(|drifts| &drifts.wheels),
             wheels_alone: of(|drifts| &drifts.wheels_alone),
             two_view_true_lengths: of(|drifts| &drifts.two_view_true_lengths),

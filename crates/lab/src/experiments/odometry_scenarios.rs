@@ -4,8 +4,8 @@
 use serde::Serialize;
 
 use super::mapless::MaplessDrift;
-use super::player::{PlayedView, Player, Sensed, Sight};
-use super::simulated_sensors::{inertial, wheels};
+use super::player::{PlayedView, Player, Reader, Sensed, Sight};
+use super::simulated_sensors::{depths, has_depths, inertial, wheels};
 use super::tracking_scores::is_wrong;
 use crate::json;
 use seese3_core::geometry::{Pose, PoseError, Twist, body_twist, exp};
@@ -39,6 +39,8 @@ pub struct Scenarios {
     pub wheels: SensorErrors,
     /// Streams with a simulated inertial sensor.
     pub inertial: SensorErrors,
+    /// Streams with simulated depths; `None` without keypoints.
+    pub depths: Option<SensorErrors>,
 }
 
 /// Position errors of the map pose at the end of a part without images, meters. In JSON, medians.
@@ -74,6 +76,9 @@ pub struct GapErrors {
     /// Errors of the map pose; in JSON, their median.
     #[serde(rename = "fused_m", serialize_with = "as_median")]
     pub fused: Vec<f64>,
+    /// The same with simulated depths.
+    #[serde(rename = "depths_m", serialize_with = "as_median")]
+    pub depths: Vec<f64>,
     /// Errors of the last map pose before the part.
     #[serde(rename = "standing_still_m", serialize_with = "as_median")]
     pub standing_still: Vec<f64>,
@@ -133,18 +138,20 @@ impl Scenarios {
             ..DarkErrors::default()
         });
         let mut kidnaps = Kidnaps::default();
-        for views in streams {
+        let depths = simulated_depths(streams, &player(None));
+        for (views, depths) in streams.iter().zip(&depths) {
             add_dark(&mut dark, views, player);
-            add_gaps(&mut gaps, views, player(first_pose(views)));
+            add_gaps(&mut gaps, views, player, depths);
             kidnaps.add(views, &|| player(None));
         }
         Self {
             gaps: gaps.to_vec(),
             kidnaps,
             dark: dark.to_vec(),
-            mapless: MaplessDrift::of(streams, player),
-            wheels: with_sensors(streams, player, wheels),
-            inertial: with_sensors(streams, player, inertial),
+            mapless: MaplessDrift::of(streams, player, &depths),
+            wheels: with_sensors(streams, player, &simulated(streams, wheels)),
+            inertial: with_sensors(streams, player, &simulated(streams, inertial)),
+            depths: has_depths(streams, &depths).then(|| with_sensors(streams, player, &depths)),
         }
     }
 
@@ -155,6 +162,7 @@ impl Scenarios {
         for room in rooms.clone().skip(1) {
             for (gap, other) in together.gaps.iter_mut().zip(&room.gaps) {
                 gap.fused.extend(&other.fused);
+                gap.depths.extend(&other.depths);
                 gap.standing_still.extend(&other.standing_still);
                 gap.constant_velocity.extend(&other.constant_velocity);
                 gap.surprises.extend(&other.surprises);
@@ -189,11 +197,32 @@ impl Scenarios {
         };
         together.mapless = MaplessDrift::mean(rooms.clone().map(|room| &room.mapless));
         let wheels: Vec<SensorErrors> = rooms.clone().map(|room| room.wheels).collect();
-        let inertial: Vec<SensorErrors> = rooms.map(|room| room.inertial).collect();
+        let inertial: Vec<SensorErrors> = rooms.clone().map(|room| room.inertial).collect();
+        let depths: Option<Vec<SensorErrors>> = rooms.map(|room| room.depths).collect();
         together.wheels = mean(&wheels);
         together.inertial = mean(&inertial);
+        together.depths = depths.map(|depths| mean(&depths));
         Some(together)
     }
+}
+
+/// What a simulated sensor says at each view of some streams.
+fn simulated(streams: &[&[PlayedView<'_>]], simulation: Simulation) -> Vec<Vec<Sensed>> {
+    let numbered = streams.iter().enumerate();
+    numbered
+        .map(|(number, views)| simulation(views, number as u64))
+        .collect()
+}
+
+/// Simulated depths; empty for streams without keypoints.
+fn simulated_depths(streams: &[&[PlayedView<'_>]], player: &Player<'_>) -> Vec<Vec<Sensed>> {
+    let numbered = streams.iter().enumerate();
+    numbered
+        .map(|(number, views)| match &player.reader {
+            Reader::Keypoints { map, .. } => depths(views, &map.map().camera, number as u64),
+            Reader::Retrieval { .. } => Vec::new(),
+        })
+        .collect()
 }
 
 fn first_pose(views: &[PlayedView<'_>]) -> Option<Pose> {
@@ -204,46 +233,96 @@ fn seconds_between(from: &PlayedView<'_>, to: &PlayedView<'_>) -> f64 {
     (to.time_ns - from.time_ns) as f64 * 1e-9
 }
 
-/// Adds the errors at the ends of parts in which no view is matched with the map.
-fn add_gaps(gaps: &mut [GapErrors], views: &[PlayedView<'_>], mut player: Player<'_>) {
+/// The end of a part without a map or without images.
+struct PartEnd<'a, 'v> {
+    /// Which of [`GAPS_S`] it lasts.
+    length: usize,
+    /// Row of the last view before the part, and the map pose there.
+    row: usize,
+    start: PoseWithCovariance,
+    view: &'a PlayedView<'v>,
+    /// The map pose; without one, the last that is known.
+    fused: PoseWithCovariance,
+}
+
+impl PartEnd<'_, '_> {
+    fn error_m(&self, pose: &Pose) -> f64 {
+        PoseError::between(pose, &self.view.truth).translation_m
+    }
+}
+
+/// Plays a stream, and from each second on a part without a map or without images.
+fn part_ends<'a, 'v>(
+    views: &'a [PlayedView<'v>],
+    mut player: Player<'_>,
+    sight: Sight,
+    sensed: &[Sensed],
+) -> Vec<PartEnd<'a, 'v>> {
+    let mut found = Vec::new();
     let mut next_s = GAP_EVERY_S;
     for (row, view) in views.iter().enumerate() {
-        let update = player.step(view, Sight::Mapped, &Sensed::default());
+        let update = player.step(view, Sight::Mapped, &sensed[row]);
         let is_due = seconds_between(&views[0], view) >= next_s;
         let pose = update.and_then(|update| update.map_pose);
-        let Some(pose) = pose.filter(|_| is_due) else {
+        let Some(start) = pose.filter(|_| is_due) else {
             continue;
         };
 
         next_s += GAP_EVERY_S;
-        let before = views[..row].iter().rev();
-        let mut before = before.filter(|other| seconds_between(other, view) >= VELOCITY_S);
-        let velocity = before.next().map_or(Twist::default(), |other| {
-            let seconds = seconds_between(other, view);
-            body_twist(&other.truth, &view.truth).scaled(seconds.recip())
-        });
-
         let mut branch = player.clone();
-        let mut ends = gaps.iter_mut().peekable();
-        for later in &views[row + 1..] {
-            let update = branch.step(later, Sight::Unmapped, &Sensed::default());
-            let seconds = seconds_between(view, later);
-            let Some(gap) = ends.next_if(|gap| seconds >= gap.seconds) else {
-                if ends.peek().is_none() {
-                    break;
-                }
-                continue;
-            };
-
-            let error_m = |pose: &Pose| PoseError::between(pose, &later.truth).translation_m;
-            gap.standing_still.push(error_m(&pose.pose));
-            let moved = pose.pose * exp(&velocity.scaled(seconds));
-            gap.constant_velocity.push(error_m(&moved));
-            // Without a pose, the last one is the best that is known.
+        let mut lengths = GAPS_S.into_iter().enumerate().peekable();
+        for (later, sensed) in views.iter().zip(sensed).skip(row + 1) {
+            let update = branch.step(later, sight, sensed);
             let fused = update.and_then(|update| update.map_pose);
-            let fused: PoseWithCovariance = fused.unwrap_or(pose);
-            gap.fused.push(error_m(&fused.pose));
-            gap.surprises.extend(fused.squared_error(&later.truth));
+            let seconds = seconds_between(view, later);
+            while let Some((length, _)) = lengths.next_if(|(_, length_s)| seconds >= *length_s) {
+                found.push(PartEnd {
+                    length,
+                    row,
+                    start,
+                    view: later,
+                    fused: fused.unwrap_or(start),
+                });
+            }
+            if lengths.peek().is_none() {
+                break;
+            }
+        }
+    }
+    found
+}
+
+/// Adds the errors at the ends of parts in which no view is matched with the map: by images alone, and with
+/// `depths` if there are any.
+fn add_gaps<'a>(
+    gaps: &mut [GapErrors],
+    views: &[PlayedView<'a>],
+    player: &dyn Fn(Option<Pose>) -> Player<'a>,
+    depths: &[Sensed],
+) {
+    let none = vec![Sensed::default(); views.len()];
+    for end in part_ends(views, player(first_pose(views)), Sight::Unmapped, &none) {
+        let start = &views[end.row];
+        let before = views[..end.row].iter().rev();
+        let mut before = before.filter(|other| seconds_between(other, start) >= VELOCITY_S);
+        let velocity = before.next().map_or(Twist::default(), |other| {
+            let seconds = seconds_between(other, start);
+            body_twist(&other.truth, &start.truth).scaled(seconds.recip())
+        });
+        let moved = exp(&velocity.scaled(seconds_between(start, end.view)));
+
+        let gap = &mut gaps[end.length];
+        gap.fused.push(end.error_m(&end.fused.pose));
+        gap.standing_still.push(end.error_m(&end.start.pose));
+        let by_velocity = end.start.pose * moved;
+        gap.constant_velocity.push(end.error_m(&by_velocity));
+        gap.surprises
+            .extend(end.fused.squared_error(&end.view.truth));
+    }
+
+    if depths.len() == views.len() {
+        for end in part_ends(views, player(first_pose(views)), Sight::Unmapped, depths) {
+            gaps[end.length].depths.push(end.error_m(&end.fused.pose));
         }
     }
 }
@@ -254,44 +333,21 @@ fn add_dark<'a>(
     views: &[PlayedView<'a>],
     player: &dyn Fn(Option<Pose>) -> Player<'a>,
 ) {
-    let none: Simulation = |views, _| vec![Sensed::default(); views.len()];
-    for (number, simulated) in [none, wheels, inertial].into_iter().enumerate() {
-        let sensed = simulated(views, 0);
-        let mut player = player(first_pose(views));
-        let mut next_s = GAP_EVERY_S;
-        for (row, view) in views.iter().enumerate() {
-            let update = player.step(view, Sight::Mapped, &sensed[row]);
-            let is_due = seconds_between(&views[0], view) >= next_s;
-            let pose = update.and_then(|update| update.map_pose);
-            let Some(pose) = pose.filter(|_| is_due) else {
-                continue;
-            };
-
-            next_s += GAP_EVERY_S;
-            let mut branch = player.clone();
-            let mut ends = dark.iter_mut().peekable();
-            for (later, sensed) in views.iter().zip(&sensed).skip(row + 1) {
-                let update = branch.step(later, Sight::Dark, sensed);
-                let seconds = seconds_between(view, later);
-                let Some(end) = ends.next_if(|end| seconds >= end.seconds) else {
-                    continue;
-                };
-                let error_m = |pose: &Pose| PoseError::between(pose, &later.truth).translation_m;
-                let fused = update.and_then(|update| update.map_pose).unwrap_or(pose);
-                let of_sensor = [&mut end.alone, &mut end.wheels, &mut end.inertial];
-                of_sensor[number].push(error_m(&fused.pose));
-                if number == 0 {
-                    end.standing_still.push(error_m(&pose.pose));
-                }
-                if number == 2 {
-                    let surprise = fused.squared_error(&later.truth);
-                    end.inertial_surprises.extend(surprise);
-                }
-                if ends.peek().is_none() {
-                    break;
-                }
-            }
-        }
+    let ends_with =
+        |sensed: Vec<Sensed>| part_ends(views, player(first_pose(views)), Sight::Dark, &sensed);
+    for end in ends_with(vec![Sensed::default(); views.len()]) {
+        let errors = &mut dark[end.length];
+        errors.alone.push(end.error_m(&end.fused.pose));
+        errors.standing_still.push(end.error_m(&end.start.pose));
+    }
+    for end in ends_with(wheels(views, 0)) {
+        dark[end.length].wheels.push(end.error_m(&end.fused.pose));
+    }
+    for end in ends_with(inertial(views, 0)) {
+        let errors = &mut dark[end.length];
+        errors.inertial.push(end.error_m(&end.fused.pose));
+        let surprise = end.fused.squared_error(&end.view.truth);
+        errors.inertial_surprises.extend(surprise);
     }
 }
 
@@ -353,18 +409,17 @@ impl Kidnaps {
 fn with_sensors<'a>(
     streams: &[&[PlayedView<'a>]],
     player: &dyn Fn(Option<Pose>) -> Player<'a>,
-    simulated: Simulation,
+    sensed: &[Vec<Sensed>],
 ) -> SensorErrors {
     let (mut fused, mut alone) = (Vec::new(), Vec::new());
     let mut tracking = 0;
     let mut count = 0;
-    for (number, views) in streams.iter().enumerate() {
+    for (views, sensed) in streams.iter().zip(sensed) {
         let Some(first) = first_pose(views) else {
             continue;
         };
-        let sensed = simulated(views, number as u64);
         let mut player = player(Some(first));
-        for (view, sensed) in views.iter().zip(&sensed) {
+        for (view, sensed) in views.iter().zip(sensed) {
             count += 1;
             let error_m = |pose: &Pose| PoseError::between(pose, &view.truth).translation_m;
             alone.extend(

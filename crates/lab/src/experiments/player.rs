@@ -15,6 +15,7 @@ use seese3_robot::pose_filter::{
     FilterState, MeasuredGravity, MeasuredInertia, PoseFilter, ViewObservation,
 };
 use seese3_robot::tracking::{Map, MeasuredPose, Status, Update};
+use seese3_robot::visual_odometry::KnownDepth;
 
 /// A view of a stream.
 #[derive(Clone, Copy)]
@@ -51,6 +52,8 @@ pub(super) enum ViewInput<'a> {
 pub(super) struct Sensed {
     pub measured: Option<MeasuredPose>,
     pub inertia: Option<MeasuredInertia>,
+    /// Of keypoints.
+    pub depths: Vec<KnownDepth>,
 }
 
 /// Whether the views of a stream are compared with the map.
@@ -70,6 +73,17 @@ pub(super) struct Player<'a> {
     pub reader: Reader<'a>,
     /// The pose of the last view, if it was located.
     pub predicted: Option<Pose>,
+}
+
+/// A view as a front end sees it.
+struct SeenView<'a, 'v> {
+    view: &'a PlayedView<'v>,
+    sight: Sight,
+    /// The pose of the last view, if it was located.
+    predicted: Option<Pose>,
+    /// The motion since the last view, if a sensor measures it.
+    motion: Option<Pose>,
+    depths: &'a [KnownDepth],
 }
 
 /// The front end of a stream, with the map.
@@ -102,25 +116,35 @@ impl Player<'_> {
         sight: Sight,
         sensed: &Sensed,
     ) -> ViewObservation {
-        let sensed = ViewObservation {
+        let by_sensors = ViewObservation {
             measured: sensed.measured,
             inertia: sensed.inertia.clone(),
             gravity: view.gravity,
             ..ViewObservation::empty(view.time_ns, view.sequence)
         };
-        let motion = self.filter.sensed_motion(&self.state, &sensed);
-        let read = self.reader.observation(view, sight, self.predicted, motion);
+        let motion = self.filter.sensed_motion(&self.state, &by_sensors);
+        let seen = SeenView {
+            view,
+            sight,
+            predicted: self.predicted,
+            motion,
+            depths: &sensed.depths,
+        };
         ViewObservation {
-            measured: sensed.measured,
-            inertia: sensed.inertia,
-            gravity: sensed.gravity,
-            ..read
+            measured: by_sensors.measured,
+            inertia: by_sensors.inertia,
+            gravity: by_sensors.gravity,
+            ..self.reader.observation(&seen)
         }
     }
 
     /// Tells the filter; `None` if it refuses the frame.
     pub fn observe(&mut self, observation: &ViewObservation) -> Option<Update> {
+        let before = self.state.odom.pose;
         let update = self.filter.observe(&mut self.state, observation).ok()?;
+        if let Reader::Keypoints { front_end, .. } = &mut self.reader {
+            front_end.assume(&before.inv_mul(&self.state.odom.pose));
+        }
         let is_located = update.status == Status::Tracking && update.match_used;
         let tracked = update.map_pose.filter(|_| is_located);
         self.predicted = tracked.map(|tracked| tracked.pose);
@@ -128,15 +152,30 @@ impl Player<'_> {
     }
 }
 
+impl<'a> SeenView<'a, '_> {
+    /// The image with these keypoints; `height` is in image widths.
+    fn image(
+        &self,
+        keypoints: &'a Keypoints,
+        height: f64,
+        fingerprint: Option<u64>,
+    ) -> StreamImage<'a> {
+        let moved = |pose: Pose| self.motion.map_or(pose, |motion| pose * motion);
+        StreamImage {
+            time_ns: self.view.time_ns,
+            keypoints,
+            height,
+            fingerprint,
+            predicted: self.predicted.map(moved),
+            predicted_motion: self.motion,
+            depths: self.depths,
+        }
+    }
+}
+
 impl Reader<'_> {
-    fn observation(
-        &mut self,
-        view: &PlayedView<'_>,
-        sight: Sight,
-        predicted: Option<Pose>,
-        motion: Option<Pose>,
-    ) -> ViewObservation {
-        let predicted = predicted.map(|pose| motion.map_or(pose, |motion| pose * motion));
+    fn observation(&mut self, seen: &SeenView<'_, '_>) -> ViewObservation {
+        let SeenView { view, sight, .. } = *seen;
         match (self, view.input) {
             (
                 Self::Keypoints {
@@ -161,14 +200,7 @@ impl Reader<'_> {
                     room: map,
                     frames: Some(mapped),
                 };
-                let image = StreamImage {
-                    time_ns: view.time_ns,
-                    keypoints,
-                    height: *height,
-                    fingerprint,
-                    predicted,
-                    predicted_motion: motion,
-                };
+                let image = seen.image(keypoints, *height, fingerprint);
                 let candidates = match sight {
                     Sight::Mapped => vec![candidate],
                     Sight::Unmapped | Sight::Dark => Vec::new(),

@@ -1,15 +1,18 @@
-//! Simulated wheels and inertial sensors of a camera on a known path.
+//! Simulated wheels, inertial sensors and depths of a camera on a known path.
 
-use nalgebra::{SVector, Unit, UnitQuaternion, Vector3, Vector4, Vector6};
+use nalgebra::{SVector, Unit, UnitQuaternion, Vector2, Vector3, Vector4, Vector6};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::player::{PlayedView, Sensed};
-use seese3_core::geometry::{Pose, Twist, body_twist, exp};
+use super::player::{PlayedView, Sensed, ViewInput};
+use seese3_core::geometry::{CameraIntrinsics, Pose, Twist, body_twist, exp};
+use seese3_core::keypoints::Keypoints;
 use seese3_core::statistics::normal_deviates;
 use seese3_robot::inertial::{GRAVITY_M_S2, InertialBuffer, InertialNoise, InertialSample};
+use seese3_robot::matched_views::{MappedKeypoints, Mapping, MappingParameters};
 use seese3_robot::pose_filter::MeasuredInertia;
 use seese3_robot::tracking::{Drift, MeasuredPose};
+use seese3_robot::visual_odometry::KnownDepth;
 
 /// Simulated wheels: relative error of lengths, rotation per meter, and noise of each step along each
 /// axis, meters.
@@ -28,6 +31,10 @@ const WHEEL_DRIFT: Drift = Drift {
 const SAMPLE_S: f64 = 5e-3;
 const DENSITIES: [f64; 2] = [2e-4, 3e-3];
 const BIASES: [f64; 2] = [5e-3, 5e-2];
+/// Simulated depth camera: standard deviation of a depth of 1 m, meters, growing with the square of the
+/// depth; and the largest relative deviation of a triangulated depth that stands for a true one.
+const DEPTH_DEVIATION: f64 = 0.005;
+const MAX_TRIANGULATION_DEVIATION: f64 = 0.1;
 /// Half of the time over which the angular rate is computed, seconds.
 const RATE_S: f64 = 5e-4;
 
@@ -58,7 +65,7 @@ pub(super) fn wheels(views: &[PlayedView<'_>], seed: u64) -> Vec<Sensed> {
             drift: WHEEL_DRIFT,
             velocity_covariance: None,
         }),
-        inertia: None,
+        ..Sensed::default()
     };
     poses.into_iter().map(sensed).collect()
 }
@@ -76,13 +83,68 @@ pub(super) fn inertial(views: &[PlayedView<'_>], seed: u64) -> Vec<Sensed> {
     };
     let motions = std::iter::once(None).chain(views.windows(2).map(motion));
     let sensed = motions.map(|motion| Sensed {
-        measured: None,
         inertia: motion.map(|motion| MeasuredInertia {
             motion,
             down_in_parent: Some(down),
         }),
+        ..Sensed::default()
     });
     sensed.collect()
+}
+
+/// What a depth camera says at each view: depths of keypoints that are triangulated with the true poses,
+/// with noise. Empty if the views have no keypoints or are too few.
+pub(super) fn depths(
+    views: &[PlayedView<'_>],
+    camera: &CameraIntrinsics,
+    seed: u64,
+) -> Vec<Sensed> {
+    let keypoints = views.iter().filter_map(|view| match view.input {
+        ViewInput::Keypoints { keypoints, .. } => Some(keypoints.clone()),
+        ViewInput::Feature { .. } => None,
+    });
+    let keypoints: Vec<Keypoints> = keypoints.collect();
+    let poses: Vec<Pose> = views.iter().map(|view| view.truth).collect();
+    if keypoints.len() < poses.len() {
+        return Vec::new();
+    }
+    let Ok(mapping) = Mapping::new(&poses, &keypoints, *camera, MappingParameters::default())
+    else {
+        return Vec::new();
+    };
+
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut sensed = |keypoints: &Keypoints, mapped: &MappedKeypoints| {
+        let noise: Vec<f64> = normal_deviates(&mut rng, mapped.len()).collect();
+        let known = (0..mapped.len()).filter_map(|place| {
+            let is_same = |point: &Vector2<f32>| *point == mapped.points[place];
+            let keypoint = keypoints.points().iter().position(is_same)?;
+            let depth_m = f64::from(mapped.inverse_depths[place]).recip();
+            let by_sensor = DEPTH_DEVIATION * depth_m;
+            let by_triangulation = f64::from(mapped.deviations[place]);
+            let is_accurate = by_triangulation < MAX_TRIANGULATION_DEVIATION;
+            is_accurate.then_some(KnownDepth {
+                keypoint,
+                depth_m: depth_m * (1.0 + by_sensor * noise[place]).max(0.1),
+                deviation: by_sensor.hypot(by_triangulation),
+            })
+        });
+        Sensed {
+            depths: known.collect(),
+            ..Sensed::default()
+        }
+    };
+    let map = mapping.map(&|| ());
+    let frames = keypoints.iter().zip(&map.frames);
+    frames
+        .map(|(keypoints, mapped)| sensed(keypoints, mapped))
+        .collect()
+}
+
+/// Whether every view of some streams has simulated depths.
+pub(super) fn has_depths(streams: &[&[PlayedView<'_>]], depths: &[Vec<Sensed>]) -> bool {
+    let mut both = streams.iter().zip(depths);
+    both.all(|(views, depths)| views.len() == depths.len())
 }
 
 fn samples(views: &[PlayedView<'_>], down: &Unit<Vector3<f64>>, seed: u64) -> Vec<InertialSample> {

@@ -228,3 +228,61 @@ pub fn fit(rooms: &[RecordedRoom<'_>], from: &FilterParameters, tried: &dyn Fn()
 pub fn trial_count() -> usize {
     ROUNDS * FACTORS.len() * <Tuned as strum::VariantArray>::VARIANTS.len()
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a failed step is a failed test")]
+mod tests {
+    use serde_json::Value;
+
+    use super::*;
+
+    /// Calls `visit` with the path of each number of a JSON value, as errors name it, and a copy of the whole
+    /// with that number replaced.
+    fn with_each(
+        whole: &Value,
+        at: &Value,
+        path: &str,
+        pointer: &str,
+        visit: &mut dyn FnMut(&str, Value),
+    ) {
+        match at {
+            Value::Object(fields) => {
+                for (name, field) in fields {
+                    let inner = if path.is_empty() {
+                        name.clone()
+                    } else {
+                        format!("{path}.{name}")
+                    };
+                    with_each(whole, field, &inner, &format!("{pointer}/{name}"), visit);
+                }
+            }
+            Value::Array(values) => {
+                for (number, value) in values.iter().enumerate() {
+                    let inner = format!("{path}[{number}]");
+                    with_each(whole, value, &inner, &format!("{pointer}/{number}"), visit);
+                }
+            }
+            _ => {
+                let mut changed = whole.clone();
+                *changed.pointer_mut(pointer).unwrap() = Value::from(1e300);
+                visit(path, changed);
+            }
+        }
+    }
+
+    /// Oracle: no parameter may be 1e300, and the error names it. Counts are refused by their type.
+    #[test]
+    fn every_parameter_has_a_range() {
+        let whole = serde_json::to_value(FilterParameters::default()).unwrap();
+        let mut count = 0;
+        with_each(&whole, &whole, "", "", &mut |path, changed| {
+            count += 1;
+            match serde_json::from_value::<FilterParameters>(changed) {
+                Ok(parameters) => assert_eq!(parameters.check().unwrap_err().field, path),
+                Err(error) => assert!(error.to_string().contains("u32"), "{path}: {error}"),
+            }
+        });
+        assert!(count > 30, "{count}");
+        assert_eq!(FilterParameters::default().check(), Ok(()));
+    }
+}

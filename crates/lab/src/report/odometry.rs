@@ -173,13 +173,19 @@ pub fn scenarios_text(rooms: &[RoomOdometry]) -> Option<String> {
         kidnaps,
         wheels,
         inertial,
+        depths,
     } = scenarios(rooms)?;
     let mut table = Table::new(
-        "no view matched for | n | fused m (median) | standing still m | constant velocity m | within 68 % | within 95 %",
+        "no view matched for | n | fused m (median) | with depths | standing still m | constant velocity m | within 68 % | within 95 %",
     );
     for gap in gaps.iter().filter(|gap| !gap.fused.is_empty()) {
-        let errors = [&gap.fused, &gap.standing_still, &gap.constant_velocity];
-        let medians = errors.map(|errors| median(errors));
+        let errors = [
+            &gap.fused,
+            &gap.depths,
+            &gap.standing_still,
+            &gap.constant_velocity,
+        ];
+        let medians = errors.map(|errors| median_or_nan(errors));
         let cells = std::iter::once(gap.fused.len().to_string())
             .chain(fixed(medians, 3))
             .chain(fixed(json::covered(&gap.surprises), 3));
@@ -198,6 +204,12 @@ pub fn scenarios_text(rooms: &[RoomOdometry]) -> Option<String> {
         "simulated inertial sensor: fused RMSE {:.3} m, TRACKING {:.3}",
         inertial.fused, inertial.tracking
     );
+    let depths = depths.map_or_else(String::new, |depths| {
+        format!(
+            "\nsimulated depths: fused RMSE {:.3} m, TRACKING {:.3}",
+            depths.fused, depths.tracking
+        )
+    });
     let kidnaps = if kidnaps.n == 0 {
         "kidnaps: the streams are too short".to_owned()
     } else {
@@ -218,8 +230,16 @@ pub fn scenarios_text(rooms: &[RoomOdometry]) -> Option<String> {
         )
     };
     Some(format!(
-        "{table}\n{dark_table}\n{mapless_table}\n{kidnaps}\n{wheels}\n{inertial}"
+        "{table}\n{dark_table}\n{mapless_table}\n{kidnaps}\n{wheels}\n{inertial}{depths}"
     ))
+}
+
+fn median_or_nan(values: &[f64]) -> f64 {
+    if values.is_empty() {
+        f64::NAN
+    } else {
+        median(values)
+    }
 }
 
 fn dark_table(dark: &[DarkErrors]) -> Table {
@@ -250,6 +270,7 @@ fn mapless_table(mapless: &MaplessDrift) -> Table {
             "images, true length of the first part",
             &mapless.images_true_length,
         ),
+        ("images and depths", &mapless.depths),
         ("images and wheels", &mapless.wheels),
         ("wheels alone", &mapless.wheels_alone),
         (

@@ -6,19 +6,21 @@
 //! 1. The camera is stated, that of the map, or estimated from the first views.
 //! 2. A view is located in the stream's room or, while that is unknown, in all rooms.
 //! 3. Visual odometry measures the motion since the last view. A located view gives it the depths of
-//!    its keypoints.
+//!    its keypoints; for other views a sensor may.
 
 mod camera;
 mod retrieval;
 
 pub use camera::StreamCamera;
-pub use retrieval::{RetrievalFrontEnd, RetrievalReading, StreamView};
+pub use retrieval::{OtherCamera, RetrievalFrontEnd, RetrievalReading, StreamView};
 
 use crate::localization::{KeypointRoom, LocatedView, NotLocated};
 use crate::matched_views::ViewKeypoints;
 use crate::pose_filter::{LocatedPose, Source, ViewObservation};
 use crate::tracking::{BestMatch, PoseWithCovariance};
-use crate::visual_odometry::{OdometryParameters, OdometryView, VisualMotion, VisualOdometry};
+use crate::visual_odometry::{
+    KnownDepth, OdometryParameters, OdometryView, VisualMotion, VisualOdometry,
+};
 use camera::CameraVotes;
 use seese3_core::geometry::{CameraIntrinsics, Pose};
 use seese3_core::index::Neighbour;
@@ -53,8 +55,10 @@ pub struct StreamImage<'a> {
     pub fingerprint: Option<u64>,
     /// The pose of the camera that the view is looked for near, `world_from_camera`.
     pub predicted: Option<Pose>,
-    /// The motion since the last image, if another sensor measures it.
+    /// The motion since the last frame, if another sensor measures it.
     pub predicted_motion: Option<Pose>,
+    /// Depths of keypoints that a sensor measures. Not used if the view is located: the map then has them.
+    pub depths: &'a [KnownDepth],
 }
 
 /// A room that an image is matched with.
@@ -114,7 +118,7 @@ pub struct ImageReading {
     /// Why no room locates the view: the camera that the matches contradict, else the reason of the
     /// most similar room. `None` for an image that is identical to the last one.
     pub why_not: Option<NotLocated>,
-    /// The motion since the last image; `None` if the images do not agree.
+    /// The motion since the last frame; `None` if the images do not agree.
     pub motion: Option<VisualMotion>,
 }
 
@@ -182,14 +186,25 @@ impl FrontEnd {
         self.odometry.is_some()
     }
 
-    /// Notes a frame without an image, or with a blank one.
+    /// Adds a frame without an image, or with a blank one.
     pub fn skip(&mut self, time_ns: i64) {
         let seconds = self.seconds_to(time_ns);
         if let Some(last) = &mut self.last {
-            last.time_ns = time_ns;
+            *last = LastImage {
+                time_ns,
+                fingerprint: None,
+            };
         }
         if let Some(odometry) = &mut self.odometry {
             odometry.skip(seconds);
+        }
+    }
+
+    /// Sets the motion to the last frame to the filter's estimate if visual odometry found none. A later image
+    /// corrects it.
+    pub fn assume(&mut self, motion: &Pose) {
+        if let Some(odometry) = &mut self.odometry {
+            odometry.assume(motion);
         }
     }
 
@@ -204,15 +219,17 @@ impl FrontEnd {
         let is_repeated = self.last.is_some_and(|last| {
             last.fingerprint.is_some() && last.fingerprint == image.fingerprint
         });
-        if is_repeated {
-            self.skip(image.time_ns);
-            return ImageReading::default();
-        }
         let seconds = self.seconds_to(image.time_ns);
         self.last = Some(LastImage {
             time_ns: image.time_ns,
             fingerprint: image.fingerprint,
         });
+        if is_repeated {
+            if let Some(odometry) = &mut self.odometry {
+                odometry.repeat(seconds);
+            }
+            return ImageReading::default();
+        }
 
         let estimated = match &mut self.camera {
             StreamCamera::Stated(_) | StreamCamera::Mapping => None,
@@ -223,6 +240,9 @@ impl FrontEnd {
         };
         let is_unknown = matches!(self.camera, StreamCamera::Unknown(_));
         if is_unknown && estimated.is_none() {
+            if let Some(odometry) = &mut self.odometry {
+                odometry.skip(seconds);
+            }
             return ImageReading {
                 why_not: Some(NotLocated::UnknownCamera),
                 ..ImageReading::default()
@@ -316,16 +336,23 @@ impl FrontEnd {
     ) -> Option<VisualMotion> {
         let located = found.located.as_ref();
         let candidate = rooms.get(located.map_or(0, |(place, _)| *place));
+        let odometry = self.odometry.as_mut()?;
         let camera = match (&self.camera, candidate) {
-            (camera, Some(candidate)) => camera.in_room(candidate.room, estimated)?,
-            (StreamCamera::Stated(camera), None) => *camera,
-            (_, None) => estimated?,
+            (camera, Some(candidate)) => camera.in_room(candidate.room, estimated),
+            (StreamCamera::Stated(camera), None) => Some(*camera),
+            (_, None) => estimated,
+        };
+        let Some(camera) = camera else {
+            odometry.skip(seconds);
+            return None;
         };
 
-        let depths = located.map_or_else(Vec::new, |(place, view)| {
-            rooms[*place].room.known_depths(view)
-        });
-        self.odometry.as_mut()?.observe(&OdometryView {
+        // The map is right about the room where a view is located; a depth camera may be wrong.
+        let depths = located.map_or_else(
+            || image.depths.to_vec(),
+            |(place, view)| rooms[*place].room.known_depths(view),
+        );
+        odometry.observe(&OdometryView {
             view: ViewKeypoints {
                 keypoints: image.keypoints,
                 camera: &camera,

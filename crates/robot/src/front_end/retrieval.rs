@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
 
+use nalgebra::Matrix6;
 use ndarray::ArrayView1;
 
 use super::ImageReading;
@@ -19,15 +20,26 @@ const CERTAIN_NOVELTY: f64 = 0.5;
 /// A view of one of the robot's cameras.
 #[derive(Debug, Clone, Copy)]
 pub struct StreamView<'a> {
-    /// Number of the camera and its pose in the frame of the stream's own camera; `None` for the
-    /// stream's own camera.
-    pub other: Option<(u32, Pose)>,
+    /// The camera; `None` for the stream's own camera.
+    pub other: Option<OtherCamera>,
     /// Latent under the adapter of the maps, shape (k,).
     pub latent: ArrayView1<'a, f64>,
     /// Raw feature of that latent, shape (d,), if known.
     pub feature: Option<&'a [f32]>,
     /// Whether the image is known to be blank.
     pub is_blank: bool,
+}
+
+/// Another camera on the robot.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct OtherCamera {
+    /// Its number.
+    pub number: u32,
+    /// Its pose when its view was taken, in the stream's own camera at the time of the frame.
+    pub camera_from_other: Pose,
+    /// Covariance of the motion between these two times, of δ on the right of the pose of the stream's own
+    /// camera, ordered (v, ω).
+    pub motion_covariance: Matrix6<f64>,
 }
 
 /// The front end of a stream of latents and features. It is kept in memory while the stream is open.
@@ -112,7 +124,7 @@ impl RetrievalFrontEnd {
             best_match: leading.map(|leading| BestMatch {
                 room: leading.room,
                 frame: leading.matched.nearest[0],
-                camera: leading.view.other.map(|(camera, _)| camera),
+                camera: leading.view.other.map(|other| other.number),
             }),
             novelty: leading.map_or(f64::INFINITY, |leading| leading.matched.out_of_distribution),
             unlocated: why_unlocated(leading),
@@ -127,7 +139,7 @@ impl RetrievalFrontEnd {
             value.to_bits().hash(&mut hasher);
         }
         let fingerprint = hasher.finish();
-        let camera = view.other.map(|(camera, _)| camera);
+        let camera = view.other.map(|other| other.number);
         let last = self.last.insert(camera, fingerprint);
         (fingerprint, last != Some(fingerprint))
     }
@@ -176,12 +188,18 @@ impl Retrieved<'_> {
         LocatedPose {
             room: self.room,
             pose: match &self.view.other {
-                Some((_, camera_from_other)) => pose.of_attached(&camera_from_other.inverse()),
+                Some(other) => {
+                    let own = pose.of_attached(&other.camera_from_other.inverse());
+                    PoseWithCovariance {
+                        covariance: own.covariance + other.motion_covariance,
+                        ..own
+                    }
+                }
                 None => pose,
             },
             source: Source::Retrieved,
             is_of_room: self.is_of_room(),
-            camera: self.view.other.map(|(camera, _)| camera),
+            camera: self.view.other.map(|other| other.number),
         }
     }
 }

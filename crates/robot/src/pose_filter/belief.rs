@@ -318,6 +318,24 @@ impl Belief {
     }
 }
 
+/// Covariance of the independent errors of a motion by visual odometry.
+pub(super) fn visual_noise(
+    visual: &VisualMotion,
+    seconds: f64,
+    parameters: &FilterParameters,
+) -> Matrix6<f64> {
+    let twist = log(&visual.motion);
+    // Wrong depths turn the translation, too, for about as long as they are in view.
+    let steps = (parameters.visual_depth_time_s / seconds.max(LEAST_SECONDS)).max(1.0);
+    let of_depths = (twist.linear.norm() * visual.scale_deviation).powi(2) * steps;
+    let mut of_translation = Matrix6::zeros();
+    of_translation
+        .fixed_view_mut::<3, 3>(0, 0)
+        .fill_diagonal(of_depths);
+    let of_matches = visual.pose_covariance * parameters.visual_design_effect;
+    parameters.visual_noise.over(&twist) + of_matches + of_translation
+}
+
 impl Step {
     /// The observation of a located pose.
     ///
@@ -369,21 +387,8 @@ impl Step {
         errors
             .fixed_view_mut::<3, 1>(0, VISUAL_SCALE)
             .copy_from(&(log(&visual.motion).linear * visual.scale_deviation));
-        let noise = parameters.visual_noise.over(&log(&visual.motion));
-        let observed = self.by_motion(&visual.motion, &errors, &noise);
-        let of_matches = visual.pose_covariance * parameters.visual_design_effect;
-        // Wrong depths turn the translation, too, for about as long as they are in view.
-        let steps = (parameters.visual_depth_time_s / seconds.max(LEAST_SECONDS)).max(1.0);
-        let of_depths =
-            (log(&visual.motion).linear.norm() * visual.scale_deviation).powi(2) * steps;
-        let mut of_translation = Matrix6::zeros();
-        of_translation
-            .fixed_view_mut::<3, 3>(0, 0)
-            .fill_diagonal(of_depths);
-        Observation {
-            noise: observed.noise + of_matches + of_translation,
-            ..observed
-        }
+        let noise = visual_noise(visual, seconds, parameters);
+        self.by_motion(&visual.motion, &errors, &noise)
     }
 
     /// The observation of a motion, with the derivatives of its twist by the lasting errors.

@@ -2,6 +2,7 @@
 
 use nalgebra::{Matrix3, Vector6};
 
+use super::belief::visual_noise;
 use super::{FilterParameters, FilterState, MeasuredInertia, Motions, WheelMotion};
 use crate::tracking::Sensor;
 use crate::visual_odometry::VisualMotion;
@@ -120,7 +121,9 @@ impl<'a> Motions<'a> {
 
         let kept = (-seconds / parameters.disagreement_time_s).exp();
         let wheels = motions.wheels.as_ref().map(of_wheels);
-        let images = motions.visual.map(|visual| of_images(visual, parameters));
+        let images = motions
+            .visual
+            .map(|visual| of_images(visual, seconds, parameters));
         let biases = state.belief.map(|belief| belief.inertial_biases());
         let inertia = motions
             .inertia
@@ -194,9 +197,9 @@ fn of_wheels(wheels: &WheelMotion) -> TwistNoise {
     }
 }
 
-fn of_images(visual: &VisualMotion, parameters: &FilterParameters) -> TwistNoise {
+fn of_images(visual: &VisualMotion, seconds: f64, parameters: &FilterParameters) -> TwistNoise {
     let twist = log(&visual.motion);
-    let noise = parameters.visual_noise.over(&twist).diagonal();
+    let noise = visual_noise(visual, seconds, parameters).diagonal();
     let lasting_m = visual.scale_deviation * twist.linear.norm();
     TwistNoise {
         twist: twist.to_vector(),

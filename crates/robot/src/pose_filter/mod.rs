@@ -43,7 +43,7 @@ use crate::visual_odometry::VisualMotion;
 use belief::{Observation, Step, twist_covariance};
 use gravity::Tilted;
 use nalgebra::Matrix6;
-use seese3_core::geometry::{Pose, log};
+use seese3_core::geometry::{Pose, Twist, log};
 use seese3_core::room::{FrameId, Room};
 
 /// Least variance of the independent noise of wheel odometry, squared meters and radians.
@@ -209,6 +209,16 @@ impl PoseFilter {
         wheels
             .filter(|_| !contradicted.wheels)
             .or(by_gyroscope.filter(|_| !contradicted.inertia))
+    }
+
+    /// Velocity at the last frame in the camera's body frame, m/s and rad/s, with its covariance. Before the
+    /// first frame it is zero, with the covariance of the motion prior.
+    pub fn velocity(&self, state: &FilterState) -> (Twist, Matrix6<f64>) {
+        let prior = &self.rooms[state.room.unwrap_or(0)].motion_prior;
+        state.belief.map_or_else(
+            || (Twist::default(), prior.velocity_covariance()),
+            |belief| (belief.velocity, belief.velocity_covariance()),
+        )
     }
 
     /// The measured motions since the last frame; none for the first one.

@@ -25,7 +25,7 @@ pub struct FilterParameters {
     /// a Gaussian process.
     pub process_noise_factor: f64,
     /// Squared Mahalanobis length of an innovation above which a located pose counts less: its
-    /// covariance is multiplied by the square of length / gate.
+    /// covariance is multiplied by the square of (squared length / gate).
     pub gate: f64,
     /// Squared Mahalanobis length of an innovation above which a located pose is not used.
     pub outlier_gate: f64,
@@ -64,7 +64,7 @@ pub struct FilterParameters {
     /// Largest speed of a measured motion, meters and radians per second. A faster one is a restart of
     /// the sensor.
     pub max_speed: [f64; 2],
-    /// Number of consecutive identical images after which a stream is DEGRADED.
+    /// Number of repetitions of an image after which a stream is DEGRADED.
     pub max_unchanged_frames: u32,
     /// Interval of keyframes, in frames; at least 1.
     #[cfg_attr(feature = "serde", serde(skip))]

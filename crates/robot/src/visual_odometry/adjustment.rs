@@ -51,11 +51,12 @@ impl LocalMap {
         }
     }
 
-    /// Adjusts the newest keyframes and the landmarks that they show, and removes outliers.
-    pub fn adjust(&mut self, focal_px: f64, parameters: &OdometryParameters) {
+    /// Adjusts the newest keyframes and the landmarks that they show, and removes outliers. If only the first
+    /// keyframe is fixed, it also tries the reversed scene. Returns whether the reversed scene was accepted.
+    pub fn adjust(&mut self, focal_px: f64, parameters: &OdometryParameters) -> bool {
         let count = self.keyframes.len();
         if count < 2 {
-            return;
+            return false;
         }
 
         let first_free = count.saturating_sub(parameters.window).max(1);
@@ -80,7 +81,18 @@ impl LocalMap {
             focal_px,
             deviation_px: parameters.deviation_px,
         };
+        let reversed = (first_free == 1).then(|| bundle.reversed());
         bundle.adjust(parameters.adjustment_steps);
+        let reversed = reversed.and_then(|mut reversed| {
+            reversed.adjust(parameters.adjustment_steps);
+            if reversed.cost() < bundle.cost() {
+                // A lower cost may only mean that the other is not at its minimum.
+                bundle.adjust(2 * parameters.adjustment_steps);
+            }
+            (reversed.cost() < bundle.cost()).then_some(reversed)
+        });
+        let is_reversed = reversed.is_some();
+        let bundle = reversed.unwrap_or(bundle);
 
         for (keyframe, pose) in self.keyframes.iter_mut().zip(&bundle.poses) {
             keyframe.pose = *pose;
@@ -89,6 +101,7 @@ impl LocalMap {
             self.take_adjusted(anchor, adjusted, &bundle, parameters);
         }
         self.update_depth_factor(parameters);
+        is_reversed
     }
 
     /// The landmarks that the keyframes from `first` on show, with a known depth or enough parallax.
@@ -186,5 +199,62 @@ impl LocalMap {
         for (keypoint, _) in bad {
             self.show(keypoint, Shown::Nothing);
         }
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a failed step is a failed test")]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use nalgebra::Vector3;
+    use seese3_testing::keypoint_scene::{Random, Scene, distorted_camera};
+
+    use super::*;
+    use crate::matched_views::{pixel_focal, plane_points};
+
+    /// Oracle: the true pose, 0.3 m to the side. The map holds the reversed scene: the camera on the other
+    /// side, turned by 0.15 rad, and near points far away.
+    #[test]
+    fn a_reversed_map_is_reversed() {
+        let scene = Scene::in_box(300, 1);
+        let camera = distorted_camera();
+        let mut random = Random::new(3);
+        let truth = Pose::translation(0.3, 0.0, 0.0);
+        let [first, second] =
+            [Pose::identity(), truth].map(|pose| scene.view(&pose, &camera, 0.5, &mut random));
+        let parameters = OdometryParameters::default();
+        let planes = [&first, &second].map(|view| plane_points(&view.keypoints, &camera, 600));
+
+        let mut map = LocalMap::new();
+        let [first_plane, second_plane] = planes;
+        map.add(
+            Pose::identity(),
+            first_plane,
+            &first.keypoints,
+            &BTreeMap::new(),
+            &parameters,
+        );
+        let anchor = |point: &usize| first.shown.iter().position(|shown| shown == point);
+        let matched = second.shown.iter().enumerate();
+        let matched = matched.filter_map(|(place, point)| Some((place, (0, anchor(point)?))));
+        let wrong = Pose::new(Vector3::x() * -0.3, Vector3::y() * -0.15);
+        let matched = matched.collect();
+        map.add(
+            wrong,
+            second_plane,
+            &second.keypoints,
+            &matched,
+            &parameters,
+        );
+        for (place, point) in first.shown.iter().enumerate() {
+            let landmark = map.landmark_mut((0, place)).unwrap();
+            landmark.inverse_depth = (0.5 - 1.0 / scene.points[*point].z).max(0.05);
+        }
+
+        assert!(map.adjust(pixel_focal(&camera), &parameters));
+        let found = map.keyframes[1].pose;
+        assert!(found.translation.vector.x > 0.1, "{found}");
+        assert!(found.rotation.angle() < 0.01, "{found}");
     }
 }

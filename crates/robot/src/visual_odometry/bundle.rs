@@ -5,10 +5,12 @@
 //! Reprojection errors have Student-t weights.
 
 use nalgebra::{
-    Cholesky, DMatrix, DVector, Matrix2x3, Matrix3, Matrix6, Matrix6x2, Vector2, Vector3, Vector6,
+    Cholesky, DMatrix, DVector, Matrix2x3, Matrix3, Matrix6, Matrix6x2, UnitQuaternion, Vector2,
+    Vector3, Vector6,
 };
 
 use seese3_core::geometry::{Pose, Twist, exp};
+use seese3_core::statistics::median;
 
 /// Degrees of freedom of the Student-t distribution of a reprojection error.
 const DEGREES_OF_FREEDOM: f64 = 4.0;
@@ -18,6 +20,8 @@ const MIN_DEPTH: f64 = 0.05;
 const BEHIND: f64 = 1e4;
 /// Minimum inverse depth of a landmark, in prior means.
 const LEAST_INVERSE_DEPTH: f64 = 0.02;
+/// Minimum inverse depth of a landmark of a reversed scene, in medians.
+const LEAST_REVERSED: f64 = 0.2;
 /// Damping of the first Levenberg–Marquardt step, the smallest, and the largest that is tried.
 const FIRST_DAMPING: f64 = 1e-4;
 const MIN_DAMPING: f64 = 1e-9;
@@ -148,6 +152,42 @@ impl Bundle {
         self.adjust(steps);
     }
 
+    /// The bundle with the relief of the scene reversed: near landmarks are far, and the free cameras move
+    /// to the opposite side of the last fixed one. Both explain small parallax almost equally well (the
+    /// reversal of Necker's cube), so an adjustment that starts at one of them does not find the other.
+    pub fn reversed(&self) -> Self {
+        let mut reversed = self.clone();
+        let Some(first_free) = self.is_free.iter().position(|is_free| *is_free) else {
+            return reversed;
+        };
+        let fixed = self.poses[first_free.saturating_sub(1)];
+        let depths: Vec<f64> = self
+            .landmarks
+            .iter()
+            .map(|landmark| landmark.inverse_depth)
+            .collect();
+        if depths.is_empty() {
+            return reversed;
+        }
+
+        let middle = median(&depths);
+        let center = Vector3::z() / middle;
+        let free = reversed.poses.iter_mut().zip(&self.is_free);
+        for (pose, _) in free.filter(|(_, is_free)| **is_free) {
+            let from_fixed = fixed.inv_mul(pose);
+            let shift = from_fixed.translation.vector;
+            let opposite = Vector3::new(-shift.x, -shift.y, shift.z);
+            let turn = UnitQuaternion::rotation_between(&(center - shift), &(center - opposite));
+            let rotation = turn.unwrap_or_default() * from_fixed.rotation;
+            *pose = fixed * Pose::from_parts(opposite.into(), rotation);
+        }
+        for landmark in &mut reversed.landmarks {
+            let opposite = 2.0 * middle - landmark.inverse_depth;
+            landmark.inverse_depth = opposite.max(LEAST_REVERSED * middle);
+        }
+        reversed
+    }
+
     /// Minimizes the cost with at most `steps` Levenberg–Marquardt steps.
     pub fn adjust(&mut self, steps: usize) {
         let mut damping = FIRST_DAMPING;
@@ -203,7 +243,7 @@ impl Bundle {
     }
 
     /// Twice the negative logarithm of the posterior density, up to a constant.
-    fn cost(&self) -> f64 {
+    pub fn cost(&self) -> f64 {
         let relative = Relative::of(self);
         let mut cost = 0.0;
         for landmark in &self.landmarks {
@@ -575,5 +615,28 @@ mod tests {
         let [marginal, joint] = [Objective::Marginal, Objective::Joint].map(translation);
         assert!(marginal < 0.01, "{marginal}");
         assert!(joint > 2.0 * marginal, "{joint} {marginal}");
+    }
+
+    /// Oracle: the true path, sideways and with little parallax. An adjustment that starts at the reversed
+    /// scene stays there, at a higher cost; reversed again, it finds the path.
+    #[test]
+    fn a_reversed_scene_is_left_by_reversing_it() {
+        let mut scene = scene([0.02, 0.0, 0.0, 0.0, 0.0, 0.0], 0.2);
+        for landmark in &mut scene.landmarks {
+            landmark.prior = [0.4, 1.0];
+        }
+        let way = |scene: &Bundle| scene.poses[3].translation.vector.x;
+        let turn_rad = |scene: &Bundle| scene.poses[3].rotation.angle();
+
+        let mut wrong = scene.reversed();
+        wrong.adjust(20);
+        assert!(way(&wrong) < -0.03, "{}", way(&wrong));
+        assert!(turn_rad(&wrong) > 0.02, "{}", turn_rad(&wrong));
+
+        let mut right = wrong.reversed();
+        right.adjust(20);
+        assert!(right.cost() < wrong.cost());
+        assert!((way(&right) - 0.06).abs() < 0.02, "{}", way(&right));
+        assert!(turn_rad(&right) < 0.005, "{}", turn_rad(&right));
     }
 }

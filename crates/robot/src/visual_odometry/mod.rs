@@ -76,8 +76,6 @@ pub struct VisualMotion {
     pub scale_deviation: f64,
     /// Number of keypoints that agree with the pose.
     pub inliers: usize,
-    /// Whether the frame became a keyframe.
-    pub is_keyframe: bool,
 }
 
 /// Visual odometry of one stream.
@@ -87,6 +85,11 @@ pub struct VisualOdometry {
     map: LocalMap,
     /// Pose of the last frame in the local map; predicted if it was not tracked.
     pose: Pose,
+    /// The pose of the frame before, if the last one was not tracked.
+    before: Option<Pose>,
+    /// Pose of the last tracked frame, and the time since then, seconds.
+    tracked_pose: Pose,
+    untracked_s: f64,
     /// Motion per second between the last two frames, in the camera's body frame.
     velocity: Twist,
     scale_deviation: f64,
@@ -133,6 +136,9 @@ impl VisualOdometry {
             parameters,
             map: LocalMap::new(),
             pose: Pose::identity(),
+            before: None,
+            tracked_pose: Pose::identity(),
+            untracked_s: 0.0,
             velocity: Twist::default(),
             scale_deviation: parameters.scale_deviations.usual,
             lost_frames: 0,
@@ -161,33 +167,44 @@ impl VisualOdometry {
         let constant_velocity = || exp(&self.velocity.scaled(observed.seconds));
         let motion = observed.predicted_motion.unwrap_or_else(constant_velocity);
         let predicted = self.pose * motion;
+        self.untracked_s += observed.seconds;
         let Some(found) = self.tracked(&predicted, &frame) else {
-            self.miss(predicted);
+            self.predict(predicted);
+            self.lose();
             return None;
         };
 
         self.lost_frames = 0;
-        let last = std::mem::replace(&mut self.pose, found.pose);
-        let is_keyframe = self.needs_keyframe(&found, &frame);
-        if is_keyframe {
+        self.before = None;
+        let mut last = std::mem::replace(&mut self.pose, found.pose);
+        if self.needs_keyframe(&found, &frame) {
             self.add_keyframe(&frame, &found.inliers);
-            self.map.adjust(frame.focal_px, &self.parameters);
+            let is_reversed = self.map.adjust(frame.focal_px, &self.parameters);
             if let Some(newest) = self.map.keyframes.back() {
                 self.pose = newest.pose;
+            }
+            if is_reversed {
+                // Exclude the correction of earlier poses from the motion of this frame.
+                let motion = last.inv_mul(&found.pose);
+                last = self.pose * motion.inverse();
+                self.tracked_pose = self.pose;
             }
         }
 
         let mut motion = last.inv_mul(&self.pose);
         motion.translation.vector *= self.corrected_scale(&found, &frame, observed.depths);
-        if observed.seconds > 0.0 {
-            self.velocity = log(&motion).scaled(observed.seconds.recip());
+        // After frames without a pose, `motion` also corrects what was assumed of them.
+        let since_tracked = self.tracked_pose.inv_mul(&self.pose);
+        if self.untracked_s > 0.0 {
+            self.velocity = log(&since_tracked).scaled(self.untracked_s.recip());
         }
+        self.tracked_pose = self.pose;
+        self.untracked_s = 0.0;
         Some(VisualMotion {
             motion,
             pose_covariance: found.covariance,
             scale_deviation: self.scale_deviation,
             inliers: found.inliers.len(),
-            is_keyframe,
         })
     }
 
@@ -197,6 +214,10 @@ impl VisualOdometry {
             return;
         }
 
+        self.lost_frames = 0;
+        self.before = None;
+        self.tracked_pose = self.pose;
+        self.untracked_s = 0.0;
         self.add_keyframe(frame, &BTreeMap::new());
         self.scale_deviation = self.parameters.scale_deviations.usual;
         let Some(newest) = self.map.keyframes.back() else {
@@ -212,17 +233,36 @@ impl VisualOdometry {
         }
     }
 
-    /// Notes a frame whose image tells nothing new, some seconds after the last one: the camera moves on
-    /// at its velocity.
+    /// Adds a frame without a usable image, some seconds after the last one: the camera is predicted to keep
+    /// its velocity.
     pub fn skip(&mut self, seconds: f64) {
-        let predicted = self.pose * exp(&self.velocity.scaled(seconds));
-        self.miss(predicted);
+        self.repeat(seconds);
+        self.lose();
     }
 
-    /// Notes a frame without a pose.
-    fn miss(&mut self, predicted: Pose) {
-        self.pose = predicted;
+    /// Adds a frame whose image is the last one again. It is as [`Self::skip`], but the frame does not count
+    /// as lost.
+    pub fn repeat(&mut self, seconds: f64) {
+        self.untracked_s += seconds;
+        self.predict(self.pose * exp(&self.velocity.scaled(seconds)));
+    }
+
+    /// Sets the motion to the last frame to this estimate if the images gave none. The motion to the next
+    /// tracked frame then corrects it.
+    pub fn assume(&mut self, motion: &Pose) {
+        if let Some(before) = self.before {
+            self.pose = before * motion;
+        }
+    }
+
+    /// Predicts the pose of a frame without one.
+    fn predict(&mut self, predicted: Pose) {
+        self.before = Some(std::mem::replace(&mut self.pose, predicted));
         self.velocity = self.velocity.scaled(LOST_VELOCITY_SHARE);
+    }
+
+    /// Counts a lost frame.
+    fn lose(&mut self) {
         self.lost_frames += 1;
         if self.lost_frames >= self.parameters.max_lost_frames {
             self.map.keyframes.clear();
@@ -247,19 +287,19 @@ impl VisualOdometry {
         depths: &[KnownDepth],
     ) -> f64 {
         let parameters = &self.parameters;
-        self.map
-            .take_depths(&found.inliers, &self.pose, &frame.plane, depths, parameters);
         let ratio = self
             .map
             .scale_ratio(&found.inliers, &self.pose, depths, parameters);
-        let Some(ratio) = ratio else { return 1.0 };
-
-        let prior = self.scale_deviation.powi(2);
-        let noise = parameters.scale_deviations.of_frame.powi(2);
-        let gain = prior / (prior + noise);
-        let factor = ratio.powf(gain);
+        let factor = ratio.map_or(1.0, |ratio| {
+            let prior = self.scale_deviation.powi(2);
+            let noise = parameters.scale_deviations.of_frame.powi(2);
+            let gain = prior / (prior + noise);
+            self.scale_deviation = (prior * (1.0 - gain)).sqrt();
+            ratio.powf(gain)
+        });
         self.map.rescale(&self.pose.translation.vector, factor);
-        self.scale_deviation = (prior * (1.0 - gain)).sqrt();
+        self.map
+            .take_depths(&found.inliers, &self.pose, &frame.plane, depths, parameters);
         factor
     }
 

@@ -379,7 +379,6 @@ fn the_sensor_that_contradicts_the_others_is_named() {
                     pose_covariance: nalgebra::Matrix6::identity() * 1e-8,
                     scale_deviation: 0.05,
                     inliers: 200,
-                    is_keyframe: false,
                 }),
                 inertia: gyroscope.filter(|_| number > 1).map(inertia),
                 ..frame(number, Some(path(&twist, number)))
@@ -420,7 +419,6 @@ fn a_wrong_scale_of_unknown_depths_is_no_contradiction() {
                     pose_covariance: nalgebra::Matrix6::identity() * 1e-8,
                     scale_deviation,
                     inliers: 200,
-                    is_keyframe: false,
                 }),
                 ..frame(number, None)
             };
@@ -458,7 +456,6 @@ fn a_contradiction_is_forgotten_while_a_sensor_is_silent() {
                 pose_covariance: nalgebra::Matrix6::identity() * 1e-8,
                 scale_deviation: 0.03,
                 inliers: 200,
-                is_keyframe: false,
             }),
             ..frame(number, None)
         };

@@ -8,6 +8,7 @@
 )]
 
 mod fitting;
+mod front_end;
 mod inertial;
 mod localization;
 mod matched_views;

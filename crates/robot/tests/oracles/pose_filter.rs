@@ -269,7 +269,6 @@ fn visual(number: u64) -> VisualMotion {
         pose_covariance: Matrix6::identity() * 1e-6,
         scale_deviation: 0.03,
         inliers: 200,
-        is_keyframe: false,
     }
 }
 

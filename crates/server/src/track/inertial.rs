@@ -230,15 +230,22 @@ fn noise(given: &pb::InertialSensor) -> Result<InertialNoise, Error> {
     })
 }
 
+/// # Errors
+/// [`Error::Invalid`] for an exposure that is too long.
+pub fn check_exposure(frame: &pb::TrackFrame) -> Result<(), Error> {
+    if frame.exposure_ns > LONGEST_EXPOSURE_NS {
+        let problem = format!("must be at most {LONGEST_EXPOSURE_NS}");
+        return Err(Error::invalid("exposure_ns", problem));
+    }
+    Ok(())
+}
+
 /// The middle of the exposure of a frame, nanoseconds; `offset_ns` is that of the images.
 ///
 /// # Errors
 /// [`Error::Invalid`] for an exposure that is too long.
 fn middle_ns(frame: &pb::TrackFrame, offset_ns: i64) -> Result<i64, Error> {
-    if frame.exposure_ns > LONGEST_EXPOSURE_NS {
-        let problem = format!("must be at most {LONGEST_EXPOSURE_NS}");
-        return Err(Error::invalid("exposure_ns", problem));
-    }
+    check_exposure(frame)?;
     let half_ns = (frame.exposure_ns / 2) as i64;
     let begins_ns = frame.timestamp_ns.saturating_add(offset_ns);
     Ok(begins_ns.saturating_add(half_ns))

@@ -8,6 +8,7 @@ use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::Pose;
 use seese3_core::keypoints::KeypointSource;
 use seese3_robot::front_end::{FrontEnd, ImageReading, RoomCandidate, StreamCamera, StreamImage};
+use seese3_robot::visual_odometry::KnownDepth;
 
 /// What the images of a stream are matched with.
 pub struct StreamRooms<'a> {
@@ -39,20 +40,20 @@ impl StreamRooms<'_> {
         candidates.collect()
     }
 
-    /// Reads an image of the stream.
+    /// Reads an image of the stream, with known depths of its keypoints.
     ///
     /// # Errors
-    /// [`Error::Invalid`] on `field` if the image has not the aspect ratio of its camera.
+    /// [`Error::Invalid`] on the image if it has not the aspect ratio of its camera.
     pub fn read(
         &self,
         front_end: &mut FrontEnd,
-        field: &str,
         image: &ImageKeypoints,
+        depths: &[KnownDepth],
         time_ns: i64,
     ) -> Result<ImageReading, Error> {
         let [width, height] = image.size;
         let mut candidates = self.candidates();
-        let invalid = |problem| Error::invalid(field, problem);
+        let invalid = |problem| Error::invalid("frame.view.image", problem);
         match front_end.camera() {
             StreamCamera::Stated(camera) => check_aspect(width, height, camera).map_err(invalid)?,
             StreamCamera::Unknown(_) => {}
@@ -77,6 +78,7 @@ impl StreamRooms<'_> {
             fingerprint: image.fingerprint(),
             predicted: predicted.filter(|_| self.room.is_some()),
             predicted_motion: self.motion,
+            depths,
         };
         Ok(front_end.read(&image, &candidates))
     }

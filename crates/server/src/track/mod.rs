@@ -5,6 +5,7 @@
 //! [`Session`] on a worker thread.
 
 mod configuration;
+mod depth;
 mod engine;
 mod inertial;
 mod keypoints;

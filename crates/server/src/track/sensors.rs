@@ -1,11 +1,12 @@
 //! Additional sensors of a stream: the direction of gravity and other cameras.
 
-use nalgebra::{Unit, Vector3};
+use nalgebra::{Matrix6, Unit, Vector3};
 
 use super::super::Error;
 use super::configuration::{LONGEST_NAME, StreamFrames, clear_name, unnamed, within};
 use seese3_client::proto::v1 as pb;
-use seese3_core::geometry::Pose;
+use seese3_core::geometry::{Pose, Twist, exp};
+use seese3_robot::front_end::OtherCamera;
 use seese3_robot::pose_filter::MeasuredGravity;
 
 /// Maximum number of other cameras of a stream.
@@ -14,6 +15,8 @@ const MOST_CAMERAS: usize = 8;
 const GRAVITY_DEVIATION: f64 = 0.03;
 /// Valid standard deviations of a measured gravity direction, radians.
 const GRAVITY_DEVIATIONS: std::ops::RangeInclusive<f64> = 1e-3..=1.0;
+/// Largest time offset of another camera, nanoseconds.
+const LONGEST_OFFSET_NS: u64 = 100_000_000;
 /// Minimum length of a direction vector.
 const SHORTEST: f64 = 1e-9;
 
@@ -26,23 +29,17 @@ pub struct Sensors {
     base: String,
     /// Frame name of the stream's own camera.
     camera: String,
-    other_cameras: Vec<OtherCamera>,
+    other_cameras: Vec<RigCamera>,
 }
 
 /// Another camera on the robot.
 #[derive(Debug, Clone)]
-struct OtherCamera {
+struct RigCamera {
     name: String,
     /// Pose in the frame of the stream's own camera.
     camera_from_other: Pose,
-}
-
-/// One of the other cameras, found by its name.
-#[derive(Debug, Clone, Copy)]
-pub struct NamedCamera {
-    /// Index in the configuration.
-    pub number: u32,
-    pub camera_from_other: Pose,
+    /// From the view of the stream's own camera to its view.
+    time_offset_s: f64,
 }
 
 impl Sensors {
@@ -100,12 +97,14 @@ impl Sensors {
             clear_name(&mut pose.parent_frame, parent);
             let pose = unnamed(pose).map_err(|error| error.within(&format!("{field}.pose")))?;
 
-            other_cameras.push(OtherCamera {
+            other_cameras.push(RigCamera {
                 name: name.clone(),
                 camera_from_other: match frames.base_from_camera {
                     Some(base_from_camera) => base_from_camera.inverse() * pose,
                     None => pose,
                 },
+                time_offset_s: time_offset_s(given.time_offset_ns)
+                    .map_err(|error| error.within(&field))?,
             });
         }
 
@@ -123,11 +122,15 @@ impl Sensors {
         self.gravity_in_map
     }
 
-    /// The other camera of this name.
+    /// The camera of this name, where the stream's own camera has this velocity, with its covariance.
     ///
     /// # Errors
     /// [`Error::Invalid`] if there is none.
-    pub fn other_camera(&self, name: &str) -> Result<NamedCamera, Error> {
+    pub fn other_camera(
+        &self,
+        name: &str,
+        (velocity, covariance): (Twist, Matrix6<f64>),
+    ) -> Result<OtherCamera, Error> {
         let number = self
             .other_cameras
             .iter()
@@ -145,9 +148,12 @@ impl Sensors {
             Error::invalid("camera", problem)
         })?;
 
-        Ok(NamedCamera {
+        let other = &self.other_cameras[number];
+        let moved = exp(&velocity.scaled(other.time_offset_s));
+        Ok(OtherCamera {
             number: number as u32,
-            camera_from_other: self.other_cameras[number].camera_from_other,
+            camera_from_other: moved * other.camera_from_other,
+            motion_covariance: covariance * other.time_offset_s.powi(2),
         })
     }
 
@@ -196,6 +202,18 @@ impl Sensors {
     }
 }
 
+/// The time offset of another camera, seconds.
+///
+/// # Errors
+/// [`Error::Invalid`] on one of more than [`LONGEST_OFFSET_NS`].
+fn time_offset_s(given_ns: i64) -> Result<f64, Error> {
+    if given_ns.unsigned_abs() > LONGEST_OFFSET_NS {
+        let problem = format!("must be -{LONGEST_OFFSET_NS} to {LONGEST_OFFSET_NS} nanoseconds");
+        return Err(Error::invalid("time_offset_ns", problem));
+    }
+    Ok(given_ns as f64 * 1e-9)
+}
+
 fn direction(field: &str, given: pb::Vector3) -> Result<Unit<Vector3<f64>>, Error> {
     let given = Vector3::new(given.x, given.y, given.z);
     let largest = given.amax();
@@ -206,4 +224,69 @@ fn direction(field: &str, given: pb::Vector3) -> Result<Unit<Vector3<f64>>, Erro
 
     // Scale first, so that squares of large numbers stay finite.
     Ok(Unit::new_normalize(given / largest))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a failed step is a failed test")]
+mod tests {
+    use super::*;
+
+    fn sensors(time_offset_ns: i64) -> Result<Sensors, Error> {
+        let ahead = pb::Pose {
+            position: Some(pb::Vector3 {
+                x: 0.0,
+                y: 0.0,
+                z: 0.2,
+            }),
+            orientation: Some(pb::Quaternion {
+                w: 1.0,
+                x: 0.0,
+                y: 0.0,
+                z: 0.0,
+            }),
+            ..pb::Pose::default()
+        };
+        let config = pb::TrackConfig {
+            other_cameras: vec![pb::RigCamera {
+                name: "front".to_owned(),
+                pose: Some(ahead),
+                time_offset_ns,
+                ..pb::RigCamera::default()
+            }],
+            ..pb::TrackConfig::default()
+        };
+        Sensors::of(&config, &StreamFrames::of(&config).unwrap())
+    }
+
+    /// By hand: at 2 m/s along x and two and a half turns per second about z, 0.1 s later the own camera has
+    /// turned by 90° on an arc of radius 0.4/π m. A camera 0.2 m ahead of it is then at the same x and y,
+    /// 0.2 m along z.
+    #[test]
+    fn a_later_view_is_moved_by_the_velocity() {
+        let velocity = Twist {
+            linear: Vector3::new(2.0, 0.0, 0.0),
+            angular: Vector3::new(0.0, 0.0, 5.0 * std::f64::consts::PI),
+        };
+        let radius = 0.4 / std::f64::consts::PI;
+        let velocity = (velocity, Matrix6::identity() * 4.0);
+
+        let later = sensors(100_000_000).unwrap();
+        let moved = later.other_camera("front", velocity).unwrap();
+        // 2 m/s and rad/s over 0.1 s.
+        let expected = Matrix6::identity() * 0.04;
+        assert!((moved.motion_covariance - expected).norm() < 1e-12);
+        let expected = Vector3::new(radius, radius, 0.2);
+        let position = moved.camera_from_other.translation.vector;
+        assert!((position - expected).norm() < 1e-12, "{position}");
+        let turned = moved.camera_from_other.rotation * Vector3::x();
+        assert!((turned - Vector3::y()).norm() < 1e-12, "{turned}");
+
+        let together = sensors(0).unwrap();
+        let unmoved = together.other_camera("front", velocity).unwrap();
+        let position = unmoved.camera_from_other.translation.vector;
+        assert!((position - Vector3::new(0.0, 0.0, 0.2)).norm() < 1e-12);
+
+        let error = sensors(2_000_000_000).unwrap_err().to_string();
+        assert!(error.contains("other_cameras[0].time_offset_ns"), "{error}");
+    }
 }

@@ -10,19 +10,20 @@ use super::super::relocalization::maps;
 use super::super::snapshot::Snapshot;
 use super::Overtaken;
 use super::configuration::{StreamFrames, back_pressure, is_fused, parameters, rooms};
+use super::depth::DepthImage;
 use super::engine::Engine;
-use super::inertial::Inertial;
+use super::inertial::{Inertial, check_exposure};
 use super::keypoints::{StreamRooms, stream_camera};
 use super::rooms::{TrackedRoom, rooms_with_keypoints};
 use super::sealed::Sealed;
-use super::sensors::{NamedCamera, Sensors};
+use super::sensors::Sensors;
 use super::token::TokenKey;
 use super::wire;
 use pb::TrackRefusalReason as Reason;
 use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::Pose;
 use seese3_core::keypoints::{KeypointSource, Keypoints};
-use seese3_robot::front_end::{FrontEnd, ImageReading, StreamView};
+use seese3_robot::front_end::{FrontEnd, ImageReading, OtherCamera, StreamView};
 use seese3_robot::localization::NotLocated;
 use seese3_robot::pose_filter::{FilterParameters, ViewObservation};
 use seese3_robot::tracking::{MeasuredPose, PoseWithCovariance, Refusal, Status, Update};
@@ -363,17 +364,21 @@ impl Session {
         self.engine.room().filter(|_| !self.is_lost)
     }
 
-    /// Reads the keypoints of the stream's own image. `motion` is that since the last frame, if a
-    /// sensor measures it.
+    /// Reads the keypoints of the stream's own image, with the depth image of its frame. `motion` is that
+    /// since the last frame, if a sensor measures it.
     fn read(
         &mut self,
         image: &ImageKeypoints,
+        depth: Option<&DepthImage>,
         time_ns: i64,
         motion: Option<Pose>,
     ) -> Result<ImageReading, Error> {
         let Some(source) = keypoint_source(&self.rooms, &self.encoders).cloned() else {
             return Ok(ImageReading::default());
         };
+        let depths = depth.map(|depth| depth.of_keypoints(image));
+        let depths = depths.transpose();
+        let depths = depths.map_err(|error| error.within("frame.depth"))?;
         let room = self.room_to_match();
         let rooms = StreamRooms {
             rooms: &self.rooms,
@@ -382,7 +387,30 @@ impl Session {
             predicted: self.last_pose,
             motion,
         };
-        rooms.read(&mut self.front_end, "frame.view.image", image, time_ns)
+        rooms.read(
+            &mut self.front_end,
+            image,
+            &depths.unwrap_or_default(),
+            time_ns,
+        )
+    }
+
+    /// The depth image of a frame; `None` too if the stream has no visual odometry.
+    fn depth(&self, frame: &pb::TrackFrame) -> Result<Option<DepthImage>, Error> {
+        let Some(given) = &frame.depth else {
+            return Ok(None);
+        };
+        let view = frame.view.as_ref().and_then(|view| view.view.as_ref());
+        if !matches!(view, Some(pb::view::View::Image(_))) {
+            return Err(Error::invalid("frame.depth", "needs an image in `view`"));
+        }
+
+        let source = keypoint_source(&self.rooms, &self.encoders);
+        let encoder = source.and_then(|source| self.encoders.keypoint_encoder(source));
+        let depth = encoder.map(|encoder| DepthImage::of(given, encoder.bounds()));
+        depth
+            .transpose()
+            .map_err(|error| error.within("frame.depth"))
     }
 
     /// An embedder of images, features and latents for the stream's adapter, which also detects
@@ -406,7 +434,10 @@ impl Session {
                 inertial.add(&frame.inertial_samples)?;
                 Ok(Some(middle_ns))
             }
-            None if frame.inertial_samples.is_empty() => Ok(None),
+            None if frame.inertial_samples.is_empty() => {
+                check_exposure(frame)?;
+                Ok(None)
+            }
             None => Err(Error::invalid(
                 "inertial_samples",
                 "need inertial_sensor in the configuration",
@@ -418,13 +449,15 @@ impl Session {
     fn encoded_other_views(
         &self,
         views: Vec<pb::OtherView>,
-    ) -> Result<Vec<(NamedCamera, EmbeddedView)>, Error> {
-        let mut seen: Vec<(NamedCamera, EmbeddedView)> = Vec::with_capacity(views.len());
+    ) -> Result<Vec<(OtherCamera, EmbeddedView)>, Error> {
+        let mut seen: Vec<(OtherCamera, EmbeddedView)> = Vec::with_capacity(views.len());
+        let Engine { filter, state, .. } = &self.engine;
+        let velocity = filter.velocity(state);
         for (number, given) in views.into_iter().enumerate() {
             let field = format!("frame.other_views[{number}]");
             let camera = self
                 .sensors
-                .other_camera(&given.camera)
+                .other_camera(&given.camera, velocity)
                 .map_err(|error| error.within(&field))?;
             if seen.iter().any(|(other, _)| other.number == camera.number) {
                 return Err(Error::invalid(
@@ -483,7 +516,9 @@ impl Session {
         };
 
         let Engine { filter, state, .. } = &mut self.engine;
+        let before = state.odom.pose;
         let update = filter.observe(state, &observation)?;
+        self.front_end.assume(&before.inv_mul(&state.odom.pose));
         if let Some((inertial, at_ns)) = self.inertial.as_mut().zip(middle_ns) {
             inertial.accept(at_ns);
         }
@@ -508,20 +543,21 @@ impl Session {
         frame: pb::TrackFrame,
         motion: Option<Pose>,
     ) -> Result<(ViewObservation, Option<NotLocated>), Error> {
+        let depth = self.depth(&frame)?;
         let own = self.embedder(true)?.embed("frame.view", frame.view)?;
         let others = self.encoded_other_views(frame.other_views)?;
         let image = match &own.keypoints {
-            Some(image) if !own.is_blank => self.read(image, frame.timestamp_ns, motion)?,
+            Some(image) if !own.is_blank => {
+                self.read(image, depth.as_ref(), frame.timestamp_ns, motion)?
+            }
             _ => {
                 self.front_end.skip(frame.timestamp_ns);
                 ImageReading::default()
             }
         };
 
-        let cameras = std::iter::once((None, &own)).chain(others.iter().map(|(camera, view)| {
-            let other = (camera.number, camera.camera_from_other);
-            (Some(other), view)
-        }));
+        let cameras = std::iter::once((None, &own))
+            .chain(others.iter().map(|(camera, view)| (Some(*camera), view)));
         let views: Vec<StreamView<'_>> = cameras
             .map(|(other, view)| StreamView {
                 other,
@@ -549,8 +585,9 @@ impl Session {
             let problem = "needs an adapter that can track in this room; leave it out";
             return Err(Error::invalid("frame.other_views", problem));
         }
+        let depth = self.depth(&frame)?;
         let image = self.keypoints_of(frame.view)?;
-        let read = self.read(&image, frame.timestamp_ns, motion)?;
+        let read = self.read(&image, depth.as_ref(), frame.timestamp_ns, motion)?;
         let fingerprint = image.fingerprint();
         Ok(read.observation(frame.timestamp_ns, frame.sequence, fingerprint))
     }

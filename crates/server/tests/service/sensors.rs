@@ -111,6 +111,7 @@ fn second_camera(mounting: &Pose) -> pb::RigCamera {
         name: "second".to_owned(),
         pose: Some(convert::pose_to_wire(mounting, "camera", "second")),
         camera: None,
+        time_offset_ns: 0,
     }
 }
 
@@ -350,6 +351,16 @@ async fn measurements_that_are_none_are_refused() {
             others(&["second"], None),
             Reason::View,
             "other_views[0].view",
+        ),
+        (
+            changed(1, |frame| frame.exposure_ns = 2_000_000_000),
+            Reason::Inertial,
+            "frame.exposure_ns: must be at most",
+        ),
+        (
+            changed(1, |frame| frame.depth = Some(pb::DepthImage::default())),
+            Reason::View,
+            "frame.depth: needs an image",
         ),
     ];
     let plain = vec![begin(rig.clone()), seen(0), seen(2)];
@@ -593,6 +604,7 @@ async fn rigs_that_are_none_are_refused() {
         name: name.to_owned(),
         pose: Some(convert::pose_to_wire(&Pose::identity(), "", "")),
         camera: None,
+        time_offset_ns: 0,
     };
     let cases = [
         (vec![named("")], "config.other_cameras[0].name"),
