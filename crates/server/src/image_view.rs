@@ -17,8 +17,8 @@ use seese3_robot::localization::{LocatedView, NotLocated};
 use seese3_robot::matched_views::ViewKeypoints;
 use seese3_store::StoredAdapter;
 
-/// Largest relative difference between the aspect ratios of an image and its camera.
-const MAX_ASPECT_DIFFERENCE: f64 = 0.01;
+/// Largest relative difference between the aspect ratios of an image and its camera or its depths.
+pub const MAX_ASPECT_DIFFERENCE: f64 = 0.01;
 
 /// Request fields of the image and its camera, for error messages.
 #[derive(Clone, Copy)]

@@ -2,7 +2,10 @@
 
 use nalgebra::Point3;
 use seese3_core::geometry::{CameraIntrinsics, Pose, PoseError};
-use seese3_robot::front_end::{FrontEnd, ImageReading, StreamCamera, StreamImage};
+use seese3_core::keypoints::Keypoints;
+use seese3_robot::front_end::{FrontEnd, ImageReading, RoomCandidate, StreamCamera, StreamImage};
+use seese3_robot::localization::KeypointRoom;
+use seese3_robot::matched_views::{Mapping, MappingParameters};
 use seese3_robot::pose_filter::{
     FilterParameters, FilterRoom, FilterState, PoseFilter, ViewObservation,
 };
@@ -152,4 +155,62 @@ fn a_local_map_outlives_a_short_gap() {
     }
     assert!(stream.read(false).motion.is_none());
     assert!(stream.read(false).motion.is_some());
+}
+
+/// Oracle: the true motions. A depth camera states ten times the depths: where the view is located, the map has
+/// them, and the lengths are right; without the map they are wrong.
+#[test]
+fn the_depths_of_a_located_view_are_those_of_the_map() {
+    let stream = Stream::new();
+    let keypoints: Vec<Keypoints> = stream
+        .views
+        .iter()
+        .map(|view| view.keypoints.clone())
+        .collect();
+    let mapping = Mapping::new(
+        &stream.truth,
+        &keypoints,
+        stream.camera,
+        MappingParameters::default(),
+    )
+    .unwrap();
+    let room = KeypointRoom::new(stream.truth.clone(), mapping.map(&|| ()).into());
+    let candidate = RoomCandidate {
+        index: 0,
+        room: &room,
+        frames: None,
+    };
+
+    let [mapped, unmapped] = [&[candidate][..], &[]].map(|rooms| {
+        let odometry = Some(OdometryParameters::default());
+        let mut front_end = FrontEnd::new(StreamCamera::Stated(stream.camera), odometry);
+        let mut lengths_m = [0.0, 0.0];
+        for (row, seen) in keypoints.iter().enumerate().take(30) {
+            let wrong = |keypoint| KnownDepth {
+                keypoint,
+                depth_m: 40.0,
+                deviation: 0.01,
+            };
+            let depths: Vec<KnownDepth> = (0..seen.len()).map(wrong).collect();
+            let image = StreamImage {
+                time_ns: row as i64 * PERIOD_NS,
+                keypoints: seen,
+                height: stream.camera.height(),
+                fingerprint: Some(row as u64),
+                predicted: None,
+                predicted_motion: None,
+                depths: &depths,
+            };
+            let read = front_end.read(&image, rooms);
+            assert_eq!(read.matched.is_some(), !rooms.is_empty());
+            if let Some(found) = read.motion {
+                let truth = stream.truth[row - 1].inv_mul(&stream.truth[row]);
+                lengths_m[0] += found.motion.translation.vector.norm();
+                lengths_m[1] += truth.translation.vector.norm();
+            }
+        }
+        lengths_m[0] / lengths_m[1]
+    });
+    assert!((mapped - 1.0).abs() < 0.05, "{mapped}");
+    assert!(unmapped > 3.0, "{unmapped}");
 }

@@ -2,6 +2,7 @@
 
 use super::super::Error;
 use super::super::embedding::ImageKeypoints;
+use super::super::image_view::MAX_ASPECT_DIFFERENCE;
 use super::configuration::within;
 use seese3_client::proto::v1 as pb;
 use seese3_encoder::{Bounds, GrayImage16, decode_gray16};
@@ -13,8 +14,6 @@ const UNITS_M: std::ops::RangeInclusive<f64> = 1e-6..=1.0;
 /// Default standard deviation of a depth of 1 m, meters, and its valid values.
 const DEVIATION_M: f64 = 0.005;
 const DEVIATIONS_M: std::ops::RangeInclusive<f64> = 1e-4..=1.0;
-/// Maximum relative difference between the aspect ratios of a depth image and its image.
-const MAX_ASPECT_DIFFERENCE: f64 = 0.01;
 /// Maximum relative standard deviation of a depth that is used.
 const MAX_DEVIATION: f64 = 0.3;
 
