@@ -117,7 +117,7 @@ impl Demo {
         let adapter_published = store
             .publish_adapter(&name, &adapter, &runs[0].record, rooms[0].1.rows())
             .await?;
-        say_published(&store, &name, &adapter_published);
+        say_published(&store, &format!("adapter '{name}'"), &adapter_published);
 
         say(format_args!(
             "3. Navigating the last 20 %, which the adapter never saw, {STRIDE} frames ahead"

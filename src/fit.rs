@@ -52,7 +52,8 @@ impl Fit {
 
         let published = refit.publish(&store, &fitted).await?;
         say_fitted(&fitted, &refit.data());
-        say_published(&store, refit.name(), &published);
+        let what = format!("adapter '{}'", refit.name());
+        say_published(&store, &what, &published);
 
         self.common.json.write(&json!({
             "adapter": refit.name(),

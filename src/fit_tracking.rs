@@ -86,7 +86,7 @@ impl FitTracking {
         ));
         say(factors_table(&found.factors));
         let mut table = Table::new(
-            "rooms | parameters | log density per frame | fused m | TRACKING | of it wrong | within 68 % | within 95 %",
+            "rooms | parameters | log density per frame | fused m | TRACKING | TRACKING wrong | within 68 % | within 95 %",
         );
         add_scores(&mut table, "fitted to", &[found.before, found.after]);
         if let Some(checks) = &checks {
@@ -99,7 +99,7 @@ impl FitTracking {
                 let published = store
                     .publish_tracking(&name, Some(found.parameters))
                     .await?;
-                say_published(&store, &name, &published);
+                say_published(&store, &format!("room '{name}'"), &published);
             }
         }
         self.json.write(&json!({

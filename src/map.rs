@@ -133,7 +133,7 @@ impl Common {
         let published = store.publish_contents(edited.contents()).await?;
         let count = edited.room().frame_count();
         say(format_args!("{count} frames"));
-        say_published(store, &self.name, &published);
+        say_published(store, &format!("room '{}'", self.name), &published);
         let mut record = json!({
             "room": self.name,
             "revision": published.revision,

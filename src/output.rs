@@ -151,8 +151,8 @@ pub fn check_printed() -> anyhow::Result<()> {
     }
 }
 
-/// Prints where an adapter was published.
-pub fn say_published(store: &seese3_store::Store, name: &str, published: &seese3_store::Published) {
+/// Prints where something was published; `what` is for example "adapter 'a'".
+pub fn say_published(store: &seese3_store::Store, what: &str, published: &seese3_store::Published) {
     let state = if published.is_new {
         "published"
     } else {
@@ -160,7 +160,7 @@ pub fn say_published(store: &seese3_store::Store, name: &str, published: &seese3
     };
 
     say(format_args!(
-        "{state} adapter '{name}' revision {}: {}/{}",
+        "{state} {what} revision {}: {}/{}",
         published.revision,
         store.location(),
         published.manifest

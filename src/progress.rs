@@ -66,11 +66,33 @@ fn line_of(bar: &WeakProgressBar, what: &str) -> Option<String> {
     let message = bar.message();
 
     Some(match bar.length().filter(|length| *length > 0) {
-        Some(length) => format!(
-            "{what}: {} of {length} after {seconds} s, about {} s left {message}",
-            bar.position(),
-            bar.eta().as_secs()
-        ),
+        Some(length) => {
+            let left = seconds_left(seconds, bar.position(), length)
+                .map_or_else(String::new, |left| format!(", about {left} s left"));
+            format!(
+                "{what}: {} of {length} after {seconds} s{left} {message}",
+                bar.position()
+            )
+        }
         None => format!("{what}: {} after {seconds} s {message}", bar.position()),
     })
+}
+
+/// The time left at the mean speed so far, seconds; `None` before the first item.
+fn seconds_left(seconds: u64, position: u64, length: u64) -> Option<u64> {
+    let items_left = length.saturating_sub(position);
+    (position > 0).then(|| seconds * items_left / position)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::seconds_left;
+
+    /// Oracle: by hand. Two of four items in 120 s leave 120 s; before the first item, nothing is known.
+    #[test]
+    fn the_time_left_is_that_of_the_mean_speed() {
+        assert_eq!(seconds_left(120, 2, 4), Some(120));
+        assert_eq!(seconds_left(30, 0, 4), None);
+        assert_eq!(seconds_left(90, 4, 4), Some(0));
+    }
 }

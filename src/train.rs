@@ -138,7 +138,7 @@ impl Train {
         ));
 
         say_scores(&runs);
-        say_published(&store, &name, &published);
+        say_published(&store, &format!("adapter '{name}'"), &published);
         self.json
             .write(&training_json(&runs, &name, published.revision))?;
 

@@ -11,7 +11,7 @@ use seese3_lab::experiments::odometry::{Relocalisation, RoomOdometry, evaluate, 
 use seese3_lab::experiments::replay::Replay;
 use seese3_lab::experiments::tracked_room::TrackingProtocol;
 use seese3_lab::report::{
-    APE_FORMULA, coverage_table, odometry_json, odometry_table, other_rooms_text,
+    APE_FORMULA, coverage_table, intervals_table, odometry_json, odometry_table, other_rooms_text,
     relocalisation_text, scenarios_text,
 };
 use seese3_robot::pose_filter::FilterParameters;
@@ -150,6 +150,10 @@ impl Odometry {
         };
         say(shown);
         say(format_args!("\ncovariances:\n{}", coverage_table(tracked)));
+        say(format_args!(
+            "\nbootstrap over rooms, and over 20 blocks of time in each:\n{}",
+            intervals_table(tracked)
+        ));
 
         if let Some(text) = scenarios_text(tracked) {
             say(format_args!("\n{text}\n"));

@@ -40,6 +40,7 @@ pub mod seeds;
 mod simple_planners;
 pub mod tracked_room;
 pub mod tracking_fit;
+pub mod tracking_intervals;
 pub mod tracking_scores;
 
 use seese3_core::room::Room;

@@ -18,6 +18,7 @@ use seese3_robot::tracking::{Map, MapMatch, MapQuery, Status, relocalize};
 use super::odometry_scenarios::Scenarios;
 use super::replay::{InitialPose, MotionSurprise, Replay};
 use super::tracked_room::TrackedRoom;
+use super::tracking_intervals::{BlockSums, TrackingIntervals, blocks_of};
 use super::tracking_scores::{LostFrames, StatusShares, TrackingScores};
 use super::{Error, Within};
 use crate::json;
@@ -33,6 +34,11 @@ pub struct RoomOdometry {
     /// Errors of the tracker and of its baselines on the same frames.
     #[serde(flatten)]
     pub scores: TrackingScores,
+    /// Sums over blocks of time, for intervals over several rooms.
+    #[serde(skip)]
+    pub blocks: Vec<BlockSums>,
+    /// 95 % intervals of the scores; `None` without frames.
+    pub intervals_95: Option<TrackingIntervals>,
     /// Source format of the recording.
     pub format: String,
     /// Number of mapped frames.
@@ -286,9 +292,13 @@ fn room_odometry<'a>(
     let views: Vec<_> = streams.iter().map(|stream| &stream.views[..]).collect();
     let scenarios = Scenarios::of(&views, &|first| tracked_room.player(first, example));
 
+    let nearest_frame = |row: usize| baselines.poses_of(tracked[row].row()).0;
+    let blocks = blocks_of(own, nearest_frame);
     Ok(RoomOdometry {
         room: room.id().to_string(),
-        scores: TrackingScores::of(own, |row| baselines.poses_of(tracked[row].row()).0),
+        scores: TrackingScores::of(own, nearest_frame),
+        intervals_95: TrackingIntervals::of(&[&blocks]),
+        blocks,
         format: room.provenance().format.clone(),
         mapped_frames: hold_out.mapped(room.timeline()).len(),
         tracked_frames: own.updates.len(),

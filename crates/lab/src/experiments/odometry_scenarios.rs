@@ -6,7 +6,7 @@ use serde::Serialize;
 use super::mapless::MaplessDrift;
 use super::player::{PlayedView, Player, Reader, Sensed, Sight};
 use super::simulated_sensors::{depths, has_depths, inertial, wheels};
-use super::tracking_scores::is_wrong;
+use super::tracking_scores::{VelocityErrors, is_wrong};
 use crate::json;
 use seese3_core::geometry::{Pose, PoseError, Twist, body_twist, exp};
 use seese3_core::statistics::{median, root_mean_square};
@@ -107,15 +107,17 @@ pub struct Kidnaps {
     pub recovered_after: Vec<f64>,
 }
 
-/// Root-mean-square position errors of streams with a simulated sensor, meters.
+/// Root-mean-square errors of streams with a simulated sensor.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct SensorErrors {
-    /// The map pose, with the sensor.
+    /// Position error of the map pose, with the sensor, meters.
     pub fused: f64,
-    /// The sensor alone, from the true first pose, if it measures poses.
+    /// The same of the sensor alone, from the true first pose, if it measures poses.
     pub alone: Option<f64>,
     /// Fraction of TRACKING frames.
     pub tracking: f64,
+    /// Velocity errors, with the sensor.
+    pub velocity: VelocityErrors,
 }
 
 fn as_median<S: serde::Serializer>(values: &[f64], to: S) -> Result<S::Ok, S::Error> {
@@ -193,6 +195,7 @@ impl Scenarios {
                     .alone
                     .map(|_| of(|errors| errors.alone.unwrap_or(0.0))),
                 tracking: of(|errors| errors.tracking),
+                velocity: VelocityErrors::mean(errors.iter().map(|errors| &errors.velocity)),
             }
         };
         together.mapless = MaplessDrift::mean(rooms.clone().map(|room| &room.mapless));
@@ -412,6 +415,7 @@ fn with_sensors<'a>(
     sensed: &[Vec<Sensed>],
 ) -> SensorErrors {
     let (mut fused, mut alone) = (Vec::new(), Vec::new());
+    let mut velocities = Vec::new();
     let mut tracking = 0;
     let mut count = 0;
     for (views, sensed) in streams.iter().zip(sensed) {
@@ -419,8 +423,10 @@ fn with_sensors<'a>(
             continue;
         };
         let mut player = player(Some(first));
+        let mut last: Option<&PlayedView<'a>> = None;
         for (view, sensed) in views.iter().zip(sensed) {
             count += 1;
+            let before = last.replace(view);
             let error_m = |pose: &Pose| PoseError::between(pose, &view.truth).translation_m;
             alone.extend(
                 sensed
@@ -431,11 +437,17 @@ fn with_sensors<'a>(
             let Some(update) = update else { continue };
             tracking += usize::from(update.status == Status::Tracking);
             fused.extend(update.map_pose.map(|pose| error_m(&pose.pose)));
+            if let (Some(before), Some(reported)) = (before, update.velocity) {
+                let seconds = (view.time_ns - before.time_ns) as f64 * 1e-9;
+                let motion = body_twist(&before.truth, &view.truth);
+                velocities.push((reported.linear, motion.linear / seconds));
+            }
         }
     }
     SensorErrors {
         fused: root_mean_square(&fused),
         alone: (!alone.is_empty()).then(|| root_mean_square(&alone)),
         tracking: tracking as f64 / count as f64,
+        velocity: VelocityErrors::of(&velocities),
     }
 }

@@ -4,6 +4,7 @@
 use serde::Serialize;
 
 use seese3_core::geometry::{Pose, PoseError, body_twist};
+use seese3_core::nalgebra::Vector3;
 use seese3_core::statistics::{mean, root_mean_square};
 use seese3_robot::tracking::{PoseWithCovariance, Status};
 
@@ -269,7 +270,7 @@ impl TrackingScores {
             tracking_surprises,
             odom_surprises,
             tracking_wrong,
-            velocity: VelocityErrors::of(replay, &keep),
+            velocity: VelocityErrors::of_replay(replay, &keep),
             drift: Drift::of(replay),
         }
     }
@@ -292,28 +293,29 @@ impl AnswerErrors {
 }
 
 impl VelocityErrors {
-    /// Errors of the linear velocities in the rows that `keep` accepts; NaN without any.
-    fn of(replay: &Replay, keep: &dyn Fn(usize) -> bool) -> Self {
-        let mut error = Vec::new();
-        let mut speed = Vec::new();
+    /// Errors of reported velocities, each with the true one, m/s; NaN without any.
+    pub fn of(velocities: &[(Vector3<f64>, Vector3<f64>)]) -> Self {
+        let rms = |of: fn(&(Vector3<f64>, Vector3<f64>)) -> f64| {
+            root_mean_square(&velocities.iter().map(of).collect::<Vec<_>>())
+        };
+        Self {
+            error_m_s: rms(|(reported, truth)| (reported - truth).norm()),
+            zero_m_s: rms(|(_, truth)| truth.norm()),
+        }
+    }
 
+    /// Errors of the linear velocities in the rows that `keep` accepts.
+    fn of_replay(replay: &Replay, keep: &dyn Fn(usize) -> bool) -> Self {
         let times = replay.truth.times_ns.windows(2);
         let poses = replay.truth.poses.windows(2).zip(times);
-        for (row, (update, (poses, times))) in (1..).zip(replay.updates.iter().skip(1).zip(poses)) {
-            let Some(reported) = update.velocity.filter(|_| keep(row)) else {
-                continue;
-            };
+        let steps = (1..).zip(replay.updates.iter().skip(1).zip(poses));
+        let velocities = steps.filter_map(|(row, (update, (poses, times)))| {
+            let reported = update.velocity.filter(|_| keep(row))?;
             let seconds = (times[1] - times[0]) as f64 * 1e-9;
             let truth = body_twist(&poses[0], &poses[1]).linear / seconds;
-
-            error.push((reported.linear - truth).norm());
-            speed.push(truth.norm());
-        }
-
-        Self {
-            error_m_s: root_mean_square(&error),
-            zero_m_s: root_mean_square(&speed),
-        }
+            Some((reported.linear, truth))
+        });
+        Self::of(&velocities.collect::<Vec<_>>())
     }
 
     /// Means over rooms.

@@ -46,7 +46,7 @@ pub use localization::{
     matched_localization_table, motion_table,
 };
 pub use odometry::{
-    OdometryJson, coverage_table, odometry_json, odometry_table, other_rooms_text,
+    OdometryJson, coverage_table, intervals_table, odometry_json, odometry_table, other_rooms_text,
     relocalisation_text, scenarios_text,
 };
 pub use path_errors::{

@@ -8,6 +8,7 @@ use crate::experiments::mapless::MaplessDrift;
 use crate::experiments::odometry::{MapPoseErrors, Relocalisation, RoomOdometry, squared_errors};
 use crate::experiments::odometry_scenarios::{DarkErrors, Scenarios};
 use crate::experiments::replay::MotionSurprise;
+use crate::experiments::tracking_intervals::TrackingIntervals;
 use crate::experiments::tracking_scores::{StatusShares, TrackingScores};
 use crate::json;
 use seese3_core::statistics::{Rate, coverage, mean, median, root_mean_square};
@@ -143,6 +144,32 @@ pub fn coverage_table(rooms: &[RoomOdometry]) -> Table {
     table
 }
 
+/// 95 % intervals of the scores, over rooms and blocks of time; empty without frames.
+pub fn intervals_table(rooms: &[RoomOdometry]) -> Table {
+    let mut table = Table::new("95 % interval | from | to");
+    let Some(found) = intervals(rooms) else {
+        return table;
+    };
+    for (name, interval) in [
+        ("fused m", found.fused_m),
+        ("nearest frame m", found.nearest_frame_m),
+        ("fused − nearest frame m", found.fused_minus_nearest_m),
+        ("TRACKING", found.tracking),
+        ("TRACKING wrong", found.tracking_wrong),
+        ("within 68 % while TRACKING", found.coverage_68),
+        ("within 95 % while TRACKING", found.coverage_95),
+        ("velocity error / of reporting 0", found.velocity_ratio),
+    ] {
+        table.row(name.to_owned(), fixed(interval, 3));
+    }
+    table
+}
+
+fn intervals(rooms: &[RoomOdometry]) -> Option<TrackingIntervals> {
+    let blocks: Vec<_> = rooms.iter().map(|room| &room.blocks[..]).collect();
+    TrackingIntervals::of(&blocks)
+}
+
 fn map_poses(rooms: &[RoomOdometry]) -> MapPoseErrors {
     let all = |of: fn(&MapPoseErrors) -> &Vec<f64>| {
         let rooms = rooms.iter().map(|room| &room.map_poses);
@@ -195,10 +222,12 @@ pub fn scenarios_text(rooms: &[RoomOdometry]) -> Option<String> {
     let dark_table = dark_table(&dark);
     let mapless_table = mapless_table(&mapless);
     let wheels = format!(
-        "simulated wheels (2 % length, 1°/m): fused RMSE {:.3} m, wheels alone {:.3} m, TRACKING {:.3}",
+        "simulated wheels (2 % length, 1°/m): fused RMSE {:.3} m, wheels alone {:.3} m, TRACKING {:.3}, velocity \
+         error {:.3} m/s",
         wheels.fused,
         wheels.alone.unwrap_or(f64::NAN),
-        wheels.tracking
+        wheels.tracking,
+        wheels.velocity.error_m_s
     );
     let inertial = format!(
         "simulated inertial sensor: fused RMSE {:.3} m, TRACKING {:.3}",
@@ -329,6 +358,7 @@ pub struct OdometryJson<'a> {
     rooms: &'a [RoomOdometry],
     #[serde(flatten)]
     all: TrackingScores,
+    intervals_95: Option<TrackingIntervals>,
     #[serde(flatten)]
     statuses: StatusShares,
     #[serde(flatten)]
@@ -351,6 +381,7 @@ pub fn odometry_json<'a>(
     OdometryJson {
         rooms,
         all: scores_of(rooms),
+        intervals_95: intervals(rooms),
         statuses: Line::of("mean", String::new(), rooms).statuses,
         scenarios: scenarios(rooms),
         coverage_places: map_poses(rooms),

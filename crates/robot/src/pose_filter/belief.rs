@@ -254,9 +254,9 @@ impl Belief {
             Some(measured) => measured.in_place_of(by_prior, self),
             None => by_prior,
         };
-        let [range_m, range_rad] = parameters.correlation_range;
         let expected = log(&predicted.motion);
-        let ranges = expected.linear.norm() / range_m + expected.angular.norm() / range_rad;
+        let ranges =
+            (expected.linear.norm() + expected.angular.norm()) / parameters.correlation_range;
         let decay = (-ranges).exp();
 
         // The errors of wheels last; the scale of visual odometry changes with the scene.
@@ -319,7 +319,7 @@ impl Belief {
 }
 
 /// Covariance of the independent errors of a motion by visual odometry.
-pub(super) fn visual_noise(
+fn visual_noise(
     visual: &VisualMotion,
     seconds: f64,
     parameters: &FilterParameters,

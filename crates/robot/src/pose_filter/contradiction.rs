@@ -1,14 +1,13 @@
 //! Sensors whose motions contradict each other.
 
-use nalgebra::{Matrix3, Vector6};
+use nalgebra::{Matrix3, Rotation3, Vector6};
 
-use super::belief::visual_noise;
 use super::{FilterParameters, FilterState, MeasuredInertia, Motions, WheelMotion};
 use crate::tracking::Sensor;
 use crate::visual_odometry::VisualMotion;
 use seese3_core::geometry::log;
 
-/// The sensors of motions that contradict others.
+/// Motion sensors that are contradicted by other sensors.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Contradicted {
@@ -20,51 +19,182 @@ pub struct Contradicted {
     pub inertia: bool,
 }
 
-/// Sums of the differences of two sensors each.
+/// Sums of the differences of two sensors each, and of motions. They are not saved in resume tokens.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Disagreements {
-    wheels_images: Disagreement,
-    inertia_images: Disagreement,
-    inertia_wheels: Disagreement,
+    /// Differences over each of `disagreement_times_s`. While images move, the shorter time is
+    /// enough: the longer sum is then cleared.
+    shorter: Differences,
+    longer: Differences,
+    /// Motions over the shorter time, or since a contradiction began.
+    wheels: UncertainTwist,
+    images: UncertainTwist,
+    /// Whether the longer sum has all differences since the contradiction began; false after a
+    /// stream was resumed.
+    is_complete: bool,
 }
 
-/// Sum of the differences of two sensors; older ones count less.
+/// Sums of the differences of two sensors each.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Disagreement {
-    /// Sum of the twists, meters and radians.
-    sum: Vector6<f64>,
-    /// Variances of the sum by independent noise, if both are right; 0 where they are not compared.
-    variances: Vector6<f64>,
-    /// Standard deviations of the sum by lasting errors, which add up.
-    lasting: Vector6<f64>,
+struct Differences {
+    wheels_images: UncertainTwist,
+    inertia_images: UncertainTwist,
+    inertia_wheels: UncertainTwist,
 }
 
-impl Disagreement {
-    /// Keeps a share of the sum.
-    fn fade(&mut self, kept: f64) {
-        self.sum *= kept;
-        self.variances *= kept * kept;
-        self.lasting *= kept;
+/// A twist with its errors, or a sum of twists.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct UncertainTwist {
+    /// Meters and radians.
+    twist: Vector6<f64>,
+    /// Variances by independent noise; 0 for components that are not measured.
+    variances: Vector6<f64>,
+    /// Standard deviations of systematic errors, which add up over the steps.
+    lasting: Vector6<f64>,
+    /// Variances of the pose errors at the two ends, which do not add up.
+    ends: Vector6<f64>,
+}
+
+impl UncertainTwist {
+    /// The difference of the twists of two sensors, whose errors are independent.
+    fn minus(&self, other: &Self) -> Self {
+        // Only components that both measure: a gyroscope measures no translation.
+        let of = |value: Vector6<f64>| {
+            let is_measured = |axis: usize| self.variances[axis].min(other.variances[axis]) > 0.0;
+            Vector6::from_fn(|axis, _| if is_measured(axis) { value[axis] } else { 0.0 })
+        };
+        Self {
+            twist: of(self.twist - other.twist),
+            variances: of(self.variances + other.variances),
+            lasting: of(self.lasting.zip_map(&other.lasting, f64::hypot)),
+            ends: of(self.ends + other.ends),
+        }
     }
 
-    /// Adds the difference of one step. Returns the squared length of the sum in standard deviations:
-    /// χ² with as many degrees of freedom as axes are compared, if both sensors are right.
-    fn add(&mut self, difference: &TwistNoise) -> f64 {
-        self.sum += difference.twist;
-        self.variances += difference.variances;
-        self.lasting += difference.lasting;
-        let axes = (0..6).filter(|&axis| self.variances[axis] > 0.0);
-        axes.map(|axis| {
-            let variance = self.variances[axis] + self.lasting[axis].powi(2);
-            self.sum[axis].powi(2) / variance
-        })
-        .sum()
+    /// Expresses the sum in the body frame after a motion.
+    fn turn(&mut self, motion: &Vector6<f64>) {
+        let after_from_before = Rotation3::new(-motion.fixed_rows::<3>(3));
+        for part in [0, 3] {
+            let turned = after_from_before * self.twist.fixed_rows::<3>(part);
+            self.twist.fixed_rows_mut::<3>(part).copy_from(&turned);
+        }
+    }
+
+    /// Adds the twist of one step. `decay` multiplies the sum so far. With `None`, during a
+    /// contradiction, the sum does not decay and gets no more noise, so that rest does not end it.
+    ///
+    /// Returns the squared length of the sum in standard deviations. If the sum of the true twists is
+    /// zero, it is χ² with one degree of freedom per measured component.
+    fn add(&mut self, decay: Option<f64>, step: Option<UncertainTwist>) -> f64 {
+        let factor = decay.unwrap_or(1.0);
+        self.twist *= factor;
+        // Without a new twist the noise stays: a silent sensor is forgotten, but not at once.
+        if let Some(step) = step {
+            self.twist += step.twist;
+            self.ends = step.ends;
+            if decay.is_some() {
+                self.variances = self.variances * factor * factor + step.variances;
+                self.lasting = self.lasting * factor + step.lasting;
+            }
+        }
+
+        let measured = (0..6).filter(|&axis| self.variances[axis] > 0.0);
+        measured
+            .map(|axis| {
+                let variance = self.variances[axis] + self.lasting[axis].powi(2) + self.ends[axis];
+                self.twist[axis].powi(2) / variance
+            })
+            .sum()
+    }
+}
+
+/// The twists of one step as the sensors measure it.
+struct Measured {
+    wheels: Option<UncertainTwist>,
+    images: Option<UncertainTwist>,
+    inertia: Option<UncertainTwist>,
+}
+
+impl Differences {
+    /// Adds a step. Returns the sensors that the sums contradict.
+    fn add(
+        &mut self,
+        decay: Option<f64>,
+        step: &Measured,
+        parameters: &FilterParameters,
+    ) -> Contradicted {
+        let disagree = |sum: &mut UncertainTwist, a: Option<UncertainTwist>, b| {
+            let difference = a.zip(b).map(|(a, b)| {
+                sum.turn(&a.twist);
+                a.minus(&b)
+            });
+            sum.add(decay, difference) > parameters.outlier_gate
+        };
+        Contradicted::of_pairs(
+            disagree(&mut self.wheels_images, step.wheels, step.images),
+            disagree(&mut self.inertia_images, step.inertia, step.images),
+            disagree(&mut self.inertia_wheels, step.inertia, step.wheels),
+            parameters.trust_wheels,
+        )
+    }
+}
+
+impl Disagreements {
+    /// Adds a step, and updates the contradicted sensors.
+    ///
+    /// A contradiction ends when the images (else the wheels) have moved since it began and the
+    /// shorter sums agree, or when the longer sum is below the gate. Time alone does not end it: a
+    /// frozen picture agrees with wheels that pause.
+    fn add(
+        &mut self,
+        contradicted: &mut Contradicted,
+        seconds: f64,
+        step: &Measured,
+        parameters: &FilterParameters,
+    ) {
+        let [decay, slow_decay] = parameters
+            .disagreement_times_s
+            .map(|time_s| Some((-seconds / time_s).exp()));
+        let is_new = !contradicted.any();
+        let short = self.shorter.add(decay, step, parameters);
+        let long = (self.longer).add(slow_decay.filter(|_| is_new), step, parameters);
+
+        let moves = |sum: &mut UncertainTwist, twist: Option<UncertainTwist>| {
+            // A systematic error scales a motion, but does not make one.
+            let lasting = Vector6::zeros();
+            let twist = twist.map(|twist| UncertainTwist { lasting, ..twist });
+            sum.add(decay.filter(|_| is_new), twist) > parameters.outlier_gate
+        };
+        let wheels = moves(&mut self.wheels, step.wheels);
+        let images = moves(&mut self.images, step.images);
+
+        let found = if short.any() { short } else { long };
+        if is_new && found.any() {
+            if short.any() {
+                self.longer = self.shorter;
+            }
+            self.wheels.twist.fill(0.0);
+            self.images.twist.fill(0.0);
+            self.is_complete = true;
+            *contradicted = found;
+            return;
+        }
+
+        let of_wheels = contradicted.any() && !contradicted.images;
+        let has_moved = if of_wheels { wheels } else { images };
+        if has_moved && !short.any() {
+            self.longer = Differences::default();
+            *contradicted = Contradicted::default();
+        } else if found.any() || self.is_complete {
+            *contradicted = found;
+        }
     }
 }
 
 impl Contradicted {
-    /// Judges from which pairs of sensors disagree. A gyroscope is seldom wrong: it decides between two
-    /// others, unless both of them contradict it and agree.
+    /// Judges from which pairs of sensors disagree. The gyroscope decides between wheels and images.
+    /// If these two agree and both contradict it, the gyroscope is contradicted. Trusted wheels
+    /// are never contradicted.
     fn of_pairs(
         wheels_images: bool,
         inertia_images: bool,
@@ -103,13 +233,12 @@ impl Contradicted {
 }
 
 impl<'a> Motions<'a> {
-    /// The motions without those of sensors that contradict others, which the state remembers. Wheels
-    /// that move faster than any robot, as after a restart, are left out too.
+    /// Updates the contradicted sensors of the state, and returns the motions of the others. Wheels that
+    /// move faster than any robot, as after a restart, are left out too.
     pub(super) fn consistent(
         self,
         state: &mut FilterState,
         seconds: f64,
-        time_ns: i64,
         parameters: &FilterParameters,
     ) -> Self {
         let motions = Self {
@@ -119,46 +248,27 @@ impl<'a> Motions<'a> {
             ..self
         };
 
-        let kept = (-seconds / parameters.disagreement_time_s).exp();
-        let wheels = motions.wheels.as_ref().map(of_wheels);
-        let images = motions
-            .visual
-            .map(|visual| of_images(visual, seconds, parameters));
-        let biases = state.belief.map(|belief| belief.inertial_biases());
-        let inertia = motions
-            .inertia
-            .as_ref()
-            .map(|inertia| of_inertia(inertia, &biases.unwrap_or_default()));
-
-        let disagree = |sum: &mut Disagreement, a: Option<TwistNoise>, b: Option<TwistNoise>| {
-            sum.fade(kept);
-            let Some((a, b)) = a.zip(b) else { return false };
-            // A gyroscope measures no translation.
-            let is_compared = |axis: usize| a.variances[axis].min(b.variances[axis]) > 0.0;
-            let of = |value: Vector6<f64>| {
-                Vector6::from_fn(|axis, _| if is_compared(axis) { value[axis] } else { 0.0 })
-            };
-            let difference = TwistNoise {
-                twist: of(a.twist - b.twist),
-                variances: of(a.variances + b.variances),
-                // Those of two sensors are independent.
-                lasting: of(a.lasting.zip_map(&b.lasting, f64::hypot)),
-            };
-            sum.add(&difference) > parameters.outlier_gate
+        let belief = state.belief;
+        let biases = belief.map_or_else(Vector6::zeros, |belief| belief.inertial_biases());
+        let (images, inertia) = (motions.visual, motions.inertia.as_ref());
+        let step = Measured {
+            wheels: motions.wheels.as_ref().map(of_wheels),
+            images: images.map(|visual| of_images(visual, parameters)),
+            inertia: inertia.map(|inertia| of_inertia(inertia, &biases)),
         };
-        let sums = &mut state.disagreements;
-        let contradicted = Contradicted::of_pairs(
-            disagree(&mut sums.wheels_images, wheels, images),
-            disagree(&mut sums.inertia_images, inertia, images),
-            disagree(&mut sums.inertia_wheels, inertia, wheels),
-            parameters.trust_wheels,
-        );
+        state
+            .disagreements
+            .add(&mut state.contradicted, seconds, &step, parameters);
+        motions.without(state.contradicted)
+    }
 
-        if contradicted.any() {
-            state.contradicted = contradicted;
-            state.contradicted_ns = Some(time_ns);
+    /// The motions without visual odometry.
+    pub(super) fn without_images(&self) -> Self {
+        Self {
+            visual: None,
+            inertia: self.inertia.clone(),
+            ..*self
         }
-        motions.without(contradicted)
     }
 
     fn without(self, contradicted: Contradicted) -> Self {
@@ -171,17 +281,7 @@ impl<'a> Motions<'a> {
     }
 }
 
-/// A twist with its errors.
-#[derive(Clone, Copy)]
-struct TwistNoise {
-    twist: Vector6<f64>,
-    /// Variances of its components by independent noise; 0 for components that are not measured.
-    variances: Vector6<f64>,
-    /// Standard deviations by lasting errors.
-    lasting: Vector6<f64>,
-}
-
-fn of_wheels(wheels: &WheelMotion) -> TwistNoise {
+fn of_wheels(wheels: &WheelMotion) -> UncertainTwist {
     let WheelMotion {
         motion,
         drift,
@@ -190,25 +290,31 @@ fn of_wheels(wheels: &WheelMotion) -> TwistNoise {
     let twist = log(motion);
     let lasting_m = drift.translation_share * twist.linear.norm();
     let lasting_rad = drift.rotation_share * (twist.angular.norm() + twist.linear.norm());
-    TwistNoise {
+    UncertainTwist {
         twist: twist.to_vector(),
         variances: noise.diagonal(),
         lasting: each(lasting_m, lasting_rad),
+        ends: Vector6::zeros(),
     }
 }
 
-fn of_images(visual: &VisualMotion, seconds: f64, parameters: &FilterParameters) -> TwistNoise {
+fn of_images(visual: &VisualMotion, parameters: &FilterParameters) -> UncertainTwist {
     let twist = log(&visual.motion);
-    let noise = visual_noise(visual, seconds, parameters).diagonal();
-    let lasting_m = visual.scale_deviation * twist.linear.norm();
-    TwistNoise {
+    // Errors of the local map are systematic, too, in the proportions of its noise.
+    let relative = &parameters.visual_noise;
+    let distance_m = twist.linear.norm();
+    let lasting_m = relative.over_motion.hypot(visual.scale_deviation) * distance_m;
+    let of_angle = relative.over_motion * twist.angular.norm();
+    let lasting_rad = of_angle.hypot(relative.rotation_over_meter * distance_m);
+    UncertainTwist {
         twist: twist.to_vector(),
-        variances: noise,
-        lasting: each(lasting_m, 0.0),
+        variances: relative.over(&twist).diagonal(),
+        lasting: each(lasting_m, lasting_rad),
+        ends: visual.pose_covariance.diagonal() * (2.0 * parameters.visual_design_effect),
     }
 }
 
-fn of_inertia(inertia: &MeasuredInertia, biases: &Vector6<f64>) -> TwistNoise {
+fn of_inertia(inertia: &MeasuredInertia, biases: &Vector6<f64>) -> UncertainTwist {
     let motion = &inertia.motion;
     let deviation = motion.noise.bias[0];
     let of_biases = motion.by_bias.fixed_view::<3, 3>(3, 0) * biases.fixed_rows::<3>(0);
@@ -221,10 +327,11 @@ fn of_inertia(inertia: &MeasuredInertia, biases: &Vector6<f64>) -> TwistNoise {
     variances
         .fixed_rows_mut::<3>(3)
         .copy_from(&covariance.diagonal());
-    TwistNoise {
+    UncertainTwist {
         twist,
         variances,
         lasting: each(0.0, deviation * motion.seconds),
+        ends: Vector6::zeros(),
     }
 }
 

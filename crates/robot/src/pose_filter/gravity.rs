@@ -8,6 +8,10 @@ use nalgebra::{Matrix3, Unit, Vector3};
 use super::FilterParameters;
 use super::belief::{Observation, Step};
 
+/// Squared Mahalanobis length of a tilt above which gravity counts less: the 99 % quantile of χ² with two
+/// degrees of freedom.
+const GATE: f64 = 9.21;
+
 /// The direction of gravity, as an accelerometer measures it in the camera's frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeasuredGravity {
@@ -62,7 +66,7 @@ impl MeasuredGravity {
         parameters: &FilterParameters,
     ) -> Option<Tilted> {
         let observed = self.observed(step);
-        let excess = step.squared_innovation(&observed) / parameters.gravity_gate;
+        let excess = step.squared_innovation(&observed) / GATE;
 
         // With the correlation ρ between successive errors, n measurements have the information of
         // n (1 − ρ)/(1 + ρ) independent ones.

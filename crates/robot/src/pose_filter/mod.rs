@@ -29,7 +29,7 @@ pub use belief::Belief;
 pub use contradiction::{Contradicted, Disagreements};
 pub use gravity::MeasuredGravity;
 pub use inertia::MeasuredInertia;
-pub use parameters::{FilterParameters, LocatedParameters, MotionNoise, ParameterError};
+pub use parameters::{FilterParameters, MotionNoise, ParameterError};
 pub use saved::SavedState;
 pub use state::{
     FilterCandidate, FilterState, KeyframeMark, LastView, LocatedPose, OdometryMark, Source,
@@ -196,7 +196,7 @@ impl PoseFilter {
     /// wheel odometry, else the rotation of the gyroscope at the velocity of the stream. `None` without
     /// either.
     pub fn sensed_motion(&self, state: &FilterState, frame: &ViewObservation) -> Option<Pose> {
-        let contradicted = state.recently_contradicted(frame.time_ns, &self.parameters);
+        let contradicted = state.contradicted;
         let seconds = state.seconds_to(frame.time_ns, frame.sequence).ok()?;
         let wheels = state
             .wheel_motion_to(frame)
@@ -261,8 +261,8 @@ impl PoseFilter {
         // the measured motions.
         let prior = &self.rooms[state.room.unwrap_or(0)].motion_prior;
         let belief = state.belief.unwrap_or_else(|| Belief::at_origin(prior));
-        let motions = motions.consistent(state, seconds, frame.time_ns, &self.parameters);
-        let mut step = self.predicted(&belief, state.is_placed, prior, seconds, &motions);
+        let motions = motions.consistent(state, seconds, &self.parameters);
+        let step = self.predicted(&belief, state.is_placed, prior, seconds, &motions);
         if let Some(wheels) = &motions.wheels {
             state.wheel_motion = state.wheel_motion.and(log(&wheels.motion));
         }
@@ -282,7 +282,7 @@ impl PoseFilter {
         state.odom = state.odom.composed(&motion);
 
         // 2. Correct by the located views.
-        let located = self.located(state, &step, frame);
+        let (mut step, located) = self.judged(state, &belief, step, frame, seconds, &motions);
         let correction = self.correct_by_views(state, &mut step, frame, &motions, &located);
 
         // 3. Correct the tilt, and make the belief after the step.
@@ -319,7 +319,7 @@ impl PoseFilter {
             velocity: (!is_first).then_some(belief.velocity),
             status,
             reason,
-            contradicted: state.contradicted_sensors(frame.time_ns, &self.parameters, tilted),
+            contradicted: state.contradicted_sensors(tilted),
             out_of_distribution: frame.novelty,
             room: state.room.filter(|_| !is_somewhere),
             best_match: frame.best_match,
@@ -331,7 +331,41 @@ impl PoseFilter {
         })
     }
 
-    /// The located poses of a frame that hold something new.
+    /// The located poses of a frame, with their innovations for a step. If keypoints locate the
+    /// leading view, and it is an outlier only because of visual odometry, returns the step without it.
+    fn judged<'a>(
+        &self,
+        state: &FilterState,
+        belief: &Belief,
+        step: Step,
+        frame: &'a ViewObservation,
+        seconds: f64,
+        motions: &Motions<'_>,
+    ) -> (Step, Vec<Located<'a>>) {
+        let located = self.located(state, &step, frame);
+        let is_certain = located.first().is_some_and(|leading| {
+            leading.located.source == Source::Matched && leading.located.is_of_room
+        });
+        let is_outlier = is_certain
+            && motions.visual.is_some()
+            && leading_innovation(&located) > self.parameters.outlier_gate
+            && state.is_located_within(self.parameters.max_candidate_s);
+        if !is_outlier {
+            return (step, located);
+        }
+
+        let prior = &self.rooms[state.room.unwrap_or(0)].motion_prior;
+        let others = motions.without_images();
+        let by_others = self.predicted(belief, state.is_placed, prior, seconds, &others);
+        let located_by_others = self.located(state, &by_others, frame);
+        if leading_innovation(&located_by_others) <= self.parameters.gate {
+            (by_others, located_by_others)
+        } else {
+            (step, located)
+        }
+    }
+
+    /// The located poses of a frame that hold something new, judged by a step.
     fn located<'a>(
         &self,
         state: &FilterState,
@@ -393,13 +427,6 @@ impl PoseFilter {
         gravity.correct(step, seconds, &self.parameters)
     }
 
-    fn parameters_of(&self, source: Source) -> LocatedParameters {
-        match source {
-            Source::Matched => self.parameters.matched,
-            Source::Retrieved => self.parameters.retrieved,
-        }
-    }
-
     /// Corrects the step by a pose that does not contradict it; returns whether it did.
     fn apply(&self, step: &mut Step, found: &Located<'_>) -> bool {
         let squared_innovation = found.squared_innovation.unwrap_or(f64::INFINITY);
@@ -416,7 +443,7 @@ impl PoseFilter {
     /// The observation of one of `count` poses that together count as one: they share the correlated
     /// part of the error.
     fn observed(&self, step: &Step, located: &LocatedPose, count: f64) -> Observation<6> {
-        let share = self.parameters_of(located.source).correlated_share;
+        let share = self.parameters.correlated_share;
         let observed = step.located(&located.pose, share);
         Observation {
             noise: observed.noise * count,
@@ -487,11 +514,8 @@ impl PoseFilter {
             None
         };
 
-        let seconds = |since: i64| frame.time_ns.abs_diff(since) as f64 * 1e-9;
-        let is_recent = state
-            .located_ns
-            .is_some_and(|located| seconds(located) <= parameters.max_candidate_s);
-        let is_certain = is_recent || step.end().place().tells_a_place();
+        let is_certain = state.is_located_within(parameters.max_candidate_s)
+            || step.end().place().tells_a_place();
         if is_certain && self.apply(step, leading) {
             if located.is_of_room {
                 state.mark_located(frame.time_ns);
@@ -502,16 +526,20 @@ impl PoseFilter {
             return Correction::Unused;
         }
 
-        let LocatedParameters {
-            correlated_share,
-            views_to_agree: needed,
-        } = self.parameters_of(located.source);
-        let (belief, agreeing) = earlier
-            .and_then(|candidate| self.supported(&candidate, frame, motions, located))
-            .unwrap_or_else(|| {
-                let prior = &self.rooms[located.room].motion_prior;
-                (Belief::at(&located.pose, prior, correlated_share), 1)
-            });
+        let [of_matched, of_retrieved] = parameters.views_to_agree;
+        let needed = match located.source {
+            Source::Matched => of_matched,
+            Source::Retrieved => of_retrieved,
+        };
+        let supported =
+            earlier.and_then(|candidate| self.supported(&candidate, frame, motions, located));
+        let is_of_same_room = earlier.is_some_and(|earlier| earlier.room == located.room);
+        let contradicts_last = is_of_same_room && supported.is_none();
+        let (belief, agreeing) = supported.unwrap_or_else(|| {
+            let prior = &self.rooms[located.room].motion_prior;
+            let share = parameters.correlated_share;
+            (Belief::at(&located.pose, prior, share), 1)
+        });
         let is_driven = parameters.trust_wheels && state.is_placed && motions.wheels.is_some();
         if agreeing >= needed && !is_driven {
             state.belief = Some(belief.with_sensors_of(state.belief.as_ref()));
@@ -528,6 +556,7 @@ impl PoseFilter {
             belief,
             agreeing,
             needed,
+            contradicts_last,
         });
         Correction::Unused
     }
@@ -559,4 +588,10 @@ impl PoseFilter {
             (step.end(), candidate.agreeing + 1)
         })
     }
+}
+
+/// Squared innovation of the leading located pose; 0 without one.
+fn leading_innovation(located: &[Located<'_>]) -> f64 {
+    let leading = located.first();
+    leading.map_or(0.0, |found| found.squared_innovation.unwrap_or(0.0))
 }

@@ -13,14 +13,14 @@ use seese3_core::geometry::{Pose, Twist, log};
     serde(default, deny_unknown_fields)
 )]
 pub struct FilterParameters {
-    /// Poses of views that are matched by keypoints.
-    pub matched: LocatedParameters,
-    /// Poses by the most similar mapped frames.
-    pub retrieved: LocatedParameters,
-    /// Distance, meters, and angle, radians, over which the correlated part of the errors of located
-    /// poses decays by a factor e. It is the error of the map in view: a camera at rest does not
-    /// average it out.
-    pub correlation_range: [f64; 2],
+    /// Share of the variance of a located pose that is correlated from view to view, 0 to 1. It is the
+    /// error of the map in view: a camera at rest does not average it out.
+    pub correlated_share: f64,
+    /// Motion, meters plus radians, over which the correlated part decays by a factor e.
+    pub correlation_range: f64,
+    /// Number of consecutive located poses that must agree to start the tracking, or to replace a pose that
+    /// they contradict: of views matched by keypoints, and of the most similar mapped frames.
+    pub views_to_agree: [u32; 2],
     /// Factor on the process noise of the motion prior: a person turns and stops more abruptly than
     /// a Gaussian process.
     pub process_noise_factor: f64,
@@ -35,8 +35,6 @@ pub struct FilterParameters {
     /// Time without a located view and without visual odometry after which a stream is DEGRADED,
     /// seconds.
     pub max_unlocated_s: f64,
-    /// Squared Mahalanobis length of a tilt above which gravity counts less.
-    pub gravity_gate: f64,
     /// Correlation time of the direction of measured gravity, seconds. Its errors come mostly from
     /// accelerations.
     pub gravity_correlation_s: f64,
@@ -58,12 +56,12 @@ pub struct FilterParameters {
     /// located views do not replace a pose that it carries.
     #[cfg_attr(feature = "serde", serde(skip))]
     pub trust_wheels: bool,
-    /// Time over which the differences of two sensors are summed, and for which a stream is DEGRADED
-    /// after they contradicted each other, seconds.
-    pub disagreement_time_s: f64,
-    /// Largest speed of a measured motion, meters and radians per second. A faster one is a restart of
-    /// the sensor.
-    pub max_speed: [f64; 2],
+    /// Times over which the differences of two sensors are summed, seconds, the shorter one first.
+    /// The longer one detects a frozen picture while the wheels move slowly.
+    pub disagreement_times_s: [f64; 2],
+    /// Largest speed of a measured motion, meters per second and radians per second. A faster one is a
+    /// restart of the sensor.
+    pub max_speed: f64,
     /// Number of repetitions of an image after which a stream is DEGRADED.
     pub max_unchanged_frames: u32,
     /// Interval of keyframes, in frames; at least 1.
@@ -77,37 +75,18 @@ pub struct FilterParameters {
     pub fuse: bool,
 }
 
-/// Parameters of located poses from one kind of source.
-#[derive(Debug, Clone, Copy, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct LocatedParameters {
-    /// Share of the variance of a pose that is correlated from view to view, 0 to 1.
-    pub correlated_share: f64,
-    /// Number of consecutive poses that must agree to start the tracking, or to replace a pose that
-    /// they contradict.
-    pub views_to_agree: u32,
-}
-
 impl Default for FilterParameters {
     fn default() -> Self {
         Self {
-            matched: LocatedParameters {
-                correlated_share: 0.7,
-                views_to_agree: 2,
-            },
-            retrieved: LocatedParameters {
-                correlated_share: 0.7,
-                views_to_agree: 10,
-            },
-            correlation_range: [0.15, 0.15],
+            correlated_share: 0.7,
+            correlation_range: 0.15,
+            views_to_agree: [2, 10],
             process_noise_factor: 4.0,
             // The 99 % quantile of χ² with six degrees of freedom, and four times that.
             gate: 16.81,
             outlier_gate: 67.24,
             max_candidate_s: 5.0,
             max_unlocated_s: 0.1,
-            // The 99 % quantile of χ² with two degrees of freedom.
-            gravity_gate: 9.21,
             gravity_correlation_s: 2.0,
             // Errors of 0.2 m and 10° are 2.6 standard deviations: rarer than 1 in 100.
             max_deviation: [0.077, 0.067],
@@ -117,8 +96,8 @@ impl Default for FilterParameters {
             visual_depth_time_s: 1.0,
             visual_scale_time_s: 10.0,
             trust_wheels: false,
-            disagreement_time_s: 1.0,
-            max_speed: [10.0, 15.0],
+            disagreement_times_s: [1.0, 20.0],
+            max_speed: 10.0,
             max_unchanged_frames: 5,
             keyframe_frames: 30,
             keyframe_displacement: f64::INFINITY,
@@ -133,37 +112,37 @@ impl Default for FilterParameters {
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct MotionNoise {
     /// At rest, meters and radians.
-    pub at_rest: [f64; 2],
-    /// Over a distance of 1 m, meters and radians.
-    pub over_meter: [f64; 2],
-    /// Of the rotation, over an angle of 1 rad, radians.
-    pub over_radian: f64,
+    pub at_rest: f64,
+    /// Over a distance of 1 m, meters, and over an angle of 1 rad, radians.
+    pub over_motion: f64,
+    /// Of the rotation, over a distance of 1 m, radians.
+    pub rotation_over_meter: f64,
 }
 
 impl MotionNoise {
     /// Noise of wheel odometry, besides its drift.
     pub const WHEELS: Self = Self {
-        at_rest: [5e-4, 5e-4],
-        over_meter: [1e-2, 5e-3],
-        over_radian: 0.0,
+        at_rest: 5e-4,
+        over_motion: 1e-2,
+        rotation_over_meter: 5e-3,
     };
 
     /// Noise of visual odometry, besides the error of its scale.
     pub const IMAGES: Self = Self {
-        at_rest: [1e-3, 1e-3],
-        over_meter: [5e-2, 2e-2],
-        over_radian: 5e-2,
+        at_rest: 1e-3,
+        over_motion: 5e-2,
+        rotation_over_meter: 2e-2,
     };
 
     /// Covariance over a motion, ordered (v, ω).
     pub fn over(&self, motion: &Twist) -> Matrix6<f64> {
         let distance_m = motion.linear.norm();
         let angle_rad = motion.angular.norm();
-        let [rest_m, rest_rad] = self.at_rest.map(|deviation| deviation.powi(2));
-        let [meter_m, meter_rad] = self.over_meter.map(|deviation| deviation.powi(2));
+        let [rest, over_motion, rotation_over_meter] =
+            [self.at_rest, self.over_motion, self.rotation_over_meter].map(|d| d.powi(2));
 
-        let v = rest_m + meter_m * distance_m;
-        let w = rest_rad + meter_rad * distance_m + self.over_radian.powi(2) * angle_rad;
+        let v = rest + over_motion * distance_m;
+        let w = rest + over_motion * angle_rad + rotation_over_meter * distance_m;
         Matrix6::from_diagonal(&Vector6::new(v, v, v, w, w, w))
     }
 }
@@ -184,8 +163,8 @@ impl FilterParameters {
     /// Whether a robot may move so far in some seconds.
     pub(super) fn is_possible(&self, motion: &Pose, seconds: f64) -> bool {
         let Twist { linear, angular } = log(motion);
-        linear.norm() <= self.max_speed[0] * seconds
-            && angular.norm() <= self.max_speed[1] * seconds
+        let most = self.max_speed * seconds;
+        linear.norm() <= most && angular.norm() <= most
     }
 
     /// The parameters with the default settings of a stream, as in a file.
@@ -209,13 +188,42 @@ impl FilterParameters {
         let share = ("0 to 0.999", 0.0..=0.999);
         let noise = ("0 to 1e9", 0.0..=1e9);
         let positive = ("1e-9 to 1e9", 1e-9..=1e9);
-        for ((expected, range), numbers) in [
-            (share, self.shares()),
-            (noise, self.noises()),
-            (positive, self.positive_numbers()),
-        ] {
-            let is_wrong = |(_, value): &(_, f64)| !range.contains(value);
-            if let Some((field, value)) = numbers.into_iter().find(is_wrong) {
+        let (wheels, images) = (&self.wheel_noise, &self.visual_noise);
+        let [deviation_m, deviation_rad] = self.max_deviation;
+        let [shorter_s, longer_s] = self.disagreement_times_s;
+        let [matched, retrieved] = self.views_to_agree.map(f64::from);
+        let gravity_s = self.gravity_correlation_s;
+        let wheels_turn = wheels.rotation_over_meter;
+        let images_turn = images.rotation_over_meter;
+
+        let numbers = [
+            ("correlated_share", &share, self.correlated_share),
+            ("correlation_range", &positive, self.correlation_range),
+            ("views_to_agree[0]", &positive, matched),
+            ("views_to_agree[1]", &positive, retrieved),
+            ("process_noise_factor", &positive, self.process_noise_factor),
+            ("gate", &positive, self.gate),
+            ("outlier_gate", &positive, self.outlier_gate),
+            ("max_candidate_s", &positive, self.max_candidate_s),
+            ("max_unlocated_s", &positive, self.max_unlocated_s),
+            ("gravity_correlation_s", &positive, gravity_s),
+            ("max_deviation[0]", &positive, deviation_m),
+            ("max_deviation[1]", &positive, deviation_rad),
+            ("wheel_noise.at_rest", &positive, wheels.at_rest),
+            ("wheel_noise.over_motion", &noise, wheels.over_motion),
+            ("wheel_noise.rotation_over_meter", &noise, wheels_turn),
+            ("visual_noise.at_rest", &positive, images.at_rest),
+            ("visual_noise.over_motion", &noise, images.over_motion),
+            ("visual_noise.rotation_over_meter", &noise, images_turn),
+            ("visual_design_effect", &positive, self.visual_design_effect),
+            ("visual_depth_time_s", &positive, self.visual_depth_time_s),
+            ("visual_scale_time_s", &positive, self.visual_scale_time_s),
+            ("disagreement_times_s[0]", &positive, shorter_s),
+            ("disagreement_times_s[1]", &positive, longer_s),
+            ("max_speed", &positive, self.max_speed),
+        ];
+        for (field, (expected, range), value) in numbers {
+            if !range.contains(&value) {
                 return Err(ParameterError {
                     field,
                     expected,
@@ -224,69 +232,5 @@ impl FilterParameters {
             }
         }
         Ok(())
-    }
-
-    fn shares(&self) -> Vec<(&'static str, f64)> {
-        vec![
-            ("matched.correlated_share", self.matched.correlated_share),
-            (
-                "retrieved.correlated_share",
-                self.retrieved.correlated_share,
-            ),
-        ]
-    }
-
-    fn noises(&self) -> Vec<(&'static str, f64)> {
-        vec![
-            ("wheel_noise.over_meter[0]", self.wheel_noise.over_meter[0]),
-            ("wheel_noise.over_meter[1]", self.wheel_noise.over_meter[1]),
-            ("wheel_noise.over_radian", self.wheel_noise.over_radian),
-            (
-                "visual_noise.over_meter[0]",
-                self.visual_noise.over_meter[0],
-            ),
-            (
-                "visual_noise.over_meter[1]",
-                self.visual_noise.over_meter[1],
-            ),
-            ("visual_noise.over_radian", self.visual_noise.over_radian),
-        ]
-    }
-
-    fn positive_numbers(&self) -> Vec<(&'static str, f64)> {
-        let [range_m, range_rad] = self.correlation_range;
-        let [deviation_m, deviation_rad] = self.max_deviation;
-        let [speed_m_s, speed_rad_s] = self.max_speed;
-        vec![
-            (
-                "matched.views_to_agree",
-                f64::from(self.matched.views_to_agree),
-            ),
-            (
-                "retrieved.views_to_agree",
-                f64::from(self.retrieved.views_to_agree),
-            ),
-            ("correlation_range[0]", range_m),
-            ("correlation_range[1]", range_rad),
-            ("process_noise_factor", self.process_noise_factor),
-            ("gate", self.gate),
-            ("outlier_gate", self.outlier_gate),
-            ("max_candidate_s", self.max_candidate_s),
-            ("max_unlocated_s", self.max_unlocated_s),
-            ("gravity_gate", self.gravity_gate),
-            ("gravity_correlation_s", self.gravity_correlation_s),
-            ("max_deviation[0]", deviation_m),
-            ("max_deviation[1]", deviation_rad),
-            ("wheel_noise.at_rest[0]", self.wheel_noise.at_rest[0]),
-            ("wheel_noise.at_rest[1]", self.wheel_noise.at_rest[1]),
-            ("visual_noise.at_rest[0]", self.visual_noise.at_rest[0]),
-            ("visual_noise.at_rest[1]", self.visual_noise.at_rest[1]),
-            ("visual_design_effect", self.visual_design_effect),
-            ("visual_depth_time_s", self.visual_depth_time_s),
-            ("visual_scale_time_s", self.visual_scale_time_s),
-            ("disagreement_time_s", self.disagreement_time_s),
-            ("max_speed[0]", speed_m_s),
-            ("max_speed[1]", speed_rad_s),
-        ]
     }
 }

@@ -116,10 +116,8 @@ pub struct FilterState {
     pub is_carried: bool,
     /// The differences between the sensors of motions.
     pub disagreements: Disagreements,
-    /// The sensors that contradicted others at `contradicted_ns`.
+    /// The sensors that are left out because of a contradiction.
     pub contradicted: Contradicted,
-    /// Time of the last frame with a contradiction, nanoseconds on the sensor's clock.
-    pub contradicted_ns: Option<i64>,
     /// Number of consecutive frames with the same image as the one before.
     pub unchanged_frames: u32,
     /// Time of the last measured gravity, nanoseconds on the sensor's clock.
@@ -175,6 +173,8 @@ pub struct FilterCandidate {
     pub agreeing: u32,
     /// Number of poses that must agree.
     pub needed: u32,
+    /// Whether the located pose before was in the same room, and did not agree.
+    pub contradicts_last: bool,
 }
 
 impl FilterState {
@@ -195,7 +195,6 @@ impl FilterState {
             is_carried: false,
             disagreements: Disagreements::default(),
             contradicted: Contradicted::default(),
-            contradicted_ns: None,
             unchanged_frames: 0,
             gravity_ns: None,
         }
@@ -262,35 +261,21 @@ impl FilterState {
         }
     }
 
-    /// The sensors that contradicted others a moment ago.
-    pub(super) fn recently_contradicted(
-        &self,
-        time_ns: i64,
-        parameters: &FilterParameters,
-    ) -> Contradicted {
-        let seconds = |since: i64| time_ns.abs_diff(since) as f64 * 1e-9;
-        let is_recent = self
-            .contradicted_ns
-            .is_some_and(|since| seconds(since) < parameters.disagreement_time_s);
-        if is_recent {
-            self.contradicted
-        } else {
-            Contradicted::default()
-        }
-    }
-
     /// All sensors that contradict others or the pose.
-    pub(super) fn contradicted_sensors(
-        &self,
-        time_ns: i64,
-        parameters: &FilterParameters,
-        tilted: Option<Tilted>,
-    ) -> Vec<Sensor> {
-        let of_motions = self.recently_contradicted(time_ns, parameters).sensors();
+    pub(super) fn contradicted_sensors(&self, tilted: Option<Tilted>) -> Vec<Sensor> {
+        let of_motions = self.contradicted.sensors();
         let gravity = tilted.map(|_| Sensor::Gravity);
         let is_disputed = self.is_placed && self.candidate.is_some();
         let views = is_disputed.then_some(Sensor::Views);
         of_motions.chain(gravity).chain(views).collect()
+    }
+
+    /// Whether a located pose was used at most `seconds` before the newest frame.
+    pub(super) fn is_located_within(&self, seconds: f64) -> bool {
+        let times = self.last.zip(self.located_ns);
+        times.is_some_and(|(last, located_ns)| {
+            last.time_ns.abs_diff(located_ns) as f64 * 1e-9 <= seconds
+        })
     }
 
     /// Notes that a view was located.

@@ -52,10 +52,7 @@ impl PoseFilter {
             return (Status::Lost, reason.to_owned());
         }
         match &state.candidate {
-            Some(candidate) => {
-                let reason = format!("{} on a place", agreement(candidate));
-                (Status::Relocalizing, reason)
-            }
+            Some(candidate) => (Status::Relocalizing, agreement(candidate, "on a place")),
             None => (Status::Lost, why_unlocated(state, frame)),
         }
     }
@@ -81,22 +78,20 @@ impl PoseFilter {
             return Some(why_unlocated(state, frame));
         }
         let since_s = |earlier: i64| frame.time_ns.abs_diff(earlier) as f64 * 1e-9;
-        let contradicted = state.recently_contradicted(frame.time_ns, parameters);
         // Without the wheels, or the inertial sensor, images carry the pose.
-        if contradicted.images && !parameters.trust_wheels {
-            let reason = if contradicted.wheels {
-                "wheel odometry and the images contradict each other: wheels slip, or the camera is frozen"
+        if state.contradicted.images && !parameters.trust_wheels {
+            let reason = if state.contradicted.wheels {
+                "wheel odometry and the images contradict each other: wheels slip, or the camera is frozen. They \
+                 are used again when they agree while moving"
             } else {
-                "the images contradict the other sensors of motion: the camera is frozen, or shows something \
-                 that moves"
+                "the images contradict the other sensors of motion: the camera is frozen, or shows \
+                 something that moves"
             };
             return Some(reason.to_owned());
         }
         if let Some(candidate) = &state.candidate {
-            let agreement = agreement(candidate);
-            return Some(format!(
-                "{agreement} on a place other than the current map pose"
-            ));
+            let place = "on a place other than the current map pose";
+            return Some(agreement(candidate, place));
         }
         let [most_m, most_rad] = parameters.max_deviation;
         let deviations = [place.position_deviation_m(), place.rotation_deviation_rad()];
@@ -122,11 +117,20 @@ impl PoseFilter {
     }
 }
 
-fn agreement(candidate: &FilterCandidate) -> String {
+/// How many views support a candidate; `place` is for example "on a place".
+fn agreement(candidate: &FilterCandidate, place: &str) -> String {
     let FilterCandidate {
-        agreeing, needed, ..
+        agreeing,
+        needed,
+        contradicts_last,
+        ..
     } = candidate;
-    format!("{agreeing} of {needed} located views agree")
+    let dispute = if *contradicts_last {
+        "; the last two contradict each other: timestamps or motion sensors may be wrong"
+    } else {
+        ""
+    };
+    format!("{agreeing} of {needed} located views agree {place}{dispute}")
 }
 
 fn contradiction(tilted: &Tilted) -> String {

@@ -16,7 +16,7 @@ const PERIOD_NS: i64 = 33_333_333;
 
 fn parameters(correlation_range: f64) -> FilterParameters {
     FilterParameters {
-        correlation_range: [correlation_range; 2],
+        correlation_range,
         ..FilterParameters::default()
     }
 }
@@ -396,6 +396,180 @@ fn wheels_reveal_frozen_images() {
     }
 }
 
+/// Oracle: the contract. Wheels at 2 to 32 cm/s drive a camera whose picture is frozen from the start, and
+/// pause for a minute: no pose over 0.2 m off is TRACKING. When the picture changes again and both
+/// move alike, the stream is TRACKING within 3 s.
+#[test]
+fn a_frozen_picture_is_not_trusted_while_wheels_are_slow_or_pause() {
+    const MOVED: u64 = 900;
+    const PAUSED: u64 = MOVED + 1_800;
+    const END: u64 = PAUSED + 90;
+    let filter = filter();
+    let drift = Drift {
+        translation_share: 0.03,
+        rotation_share: 0.03,
+    };
+    let along = |steps: f64| {
+        let twist = log(&path(1)).scaled(steps);
+        exp(&twist)
+    };
+    for speed in [0.05, 0.2, 1.0] {
+        let truth = |number: u64| {
+            let driven = number.min(MOVED) as f64 * speed;
+            along(driven + number.saturating_sub(PAUSED) as f64)
+        };
+        let mut state = filter.start(None);
+        let mut last = None;
+        for number in 1..=END {
+            let seen = if number > PAUSED { number } else { 1 };
+            let is_motion_seen = number > PAUSED + 1;
+            let motion = if is_motion_seen {
+                truth(number - 1).inv_mul(&truth(number))
+            } else {
+                Pose::identity()
+            };
+            let observed = ViewObservation {
+                visual: (number > 1 && number != PAUSED + 1).then(|| VisualMotion {
+                    motion,
+                    ..visual(2)
+                }),
+                measured: Some(MeasuredPose {
+                    pose: truth(number),
+                    velocity_covariance: None,
+                    drift,
+                }),
+                ..view(number, Some(truth(seen)))
+            };
+            let update = filter.observe(&mut state, &observed).unwrap();
+            if update.status == Status::Tracking {
+                assert!(error_m(&update, &truth(number)) < 0.2, "{speed} {number}");
+            }
+            last = Some(update);
+        }
+        let last = last.unwrap();
+        assert_eq!(last.status, Status::Tracking, "{}", last.reason);
+        assert!(last.contradicted.is_empty());
+    }
+}
+
+/// Oracle: the contract. The picture freezes while the camera moves, and the wheels stop 0.6 to 1 s later:
+/// the motion before does not end the contradiction. Odometry that is missing in one frame does not
+/// end it either.
+#[test]
+fn a_picture_that_freezes_before_a_stop_is_not_trusted() {
+    const FROZEN: u64 = 60;
+    let filter = filter();
+    let along = |number: u64| exp(&log(&path(1)).scaled(2.0 * number as f64));
+    for stop in [FROZEN + 18, FROZEN + 24, FROZEN + 30] {
+        for missing in [None, Some(stop + 5)] {
+            let mut state = filter.start(None);
+            for number in 1..=600 {
+                let truth = along(number.min(stop));
+                let seen = number.min(FROZEN);
+                let motion = along(seen.min(number - 1)).inv_mul(&along(seen));
+                let observed = ViewObservation {
+                    visual: (number > 1).then(|| VisualMotion {
+                        motion,
+                        ..visual(2)
+                    }),
+                    measured: (missing != Some(number)).then_some(MeasuredPose {
+                        pose: truth,
+                        velocity_covariance: None,
+                        drift: Drift {
+                            translation_share: 0.03,
+                            rotation_share: 0.03,
+                        },
+                    }),
+                    ..view(number, Some(along(seen)))
+                };
+                let update = filter.observe(&mut state, &observed).unwrap();
+                if update.status == Status::Tracking {
+                    assert!(error_m(&update, &truth) < 0.2, "{stop} {number}");
+                }
+            }
+        }
+    }
+}
+
+/// Oracle: by hand. Beside a frozen picture, the robot drives 0.5 m, turns by 180°, drives 0.5 m back in its own
+/// frame and turns back: it is 1 m away, though its twists sum to zero.
+#[test]
+fn a_sum_of_differences_turns_with_the_robot() {
+    let drive = |length_m: f64| Pose::translation(0.0, 0.0, length_m / 30.0);
+    let turn = |angle_rad: f64| {
+        exp(&Twist {
+            angular: Vector3::new(0.0, angle_rad / 30.0, 0.0),
+            ..Twist::default()
+        })
+    };
+    let half = std::f64::consts::PI;
+    let filter = filter();
+    let mut state = filter.start(None);
+    let mut truth = Pose::identity();
+    for number in 1..=900 {
+        truth *= match number {
+            61..=90 => drive(0.5),
+            91..=120 => turn(half),
+            121..=150 => drive(-0.5),
+            151..=180 => turn(-half),
+            _ => Pose::identity(),
+        };
+        let observed = ViewObservation {
+            visual: (number > 1).then(|| VisualMotion {
+                motion: Pose::identity(),
+                ..visual(2)
+            }),
+            measured: Some(MeasuredPose {
+                pose: truth,
+                velocity_covariance: None,
+                drift: Drift {
+                    translation_share: 0.03,
+                    rotation_share: 0.03,
+                },
+            }),
+            ..view(number, Some(Pose::identity()))
+        };
+        let update = filter.observe(&mut state, &observed).unwrap();
+        let is_tracking = update.status == Status::Tracking;
+        assert!(number < 100 || !is_tracking, "{number}");
+    }
+    assert!((truth.translation.vector.norm() - 1.0).abs() < 1e-9);
+}
+
+/// Oracle: the definition of a covariance. Wheels with negated translations contradict the images. When the
+/// images end, the wheels do not carry the pose.
+#[test]
+fn contradicted_wheels_do_not_carry_a_blackout() {
+    let filter = filter();
+    let mut state = filter.start(None);
+    let mut last = None;
+    for number in 1..=90 {
+        let is_dark = number > 60;
+        let mut wheels = path(number);
+        wheels.translation.vector.neg_mut();
+        let observed = ViewObservation {
+            visual: (number > 1 && !is_dark).then(|| visual(number)),
+            measured: Some(MeasuredPose {
+                pose: wheels,
+                velocity_covariance: None,
+                drift: Drift {
+                    translation_share: 0.03,
+                    rotation_share: 0.03,
+                },
+            }),
+            fingerprint: (!is_dark).then_some(number),
+            ..view(number, (!is_dark).then(|| path(number)))
+        };
+        last = Some(filter.observe(&mut state, &observed).unwrap());
+    }
+
+    let update = last.unwrap();
+    assert_eq!(update.status, Status::Degraded, "{}", update.reason);
+    // The 99 % quantile of χ² with six degrees of freedom.
+    let place = update.map_pose.unwrap();
+    assert!(place.squared_error(&path(90)).unwrap() < 16.8);
+}
+
 /// Oracle: the contract: wheels that begin a new odometry frame, 100 m away, do not move the pose.
 #[test]
 fn restarted_wheels_do_not_move_the_pose() {
@@ -587,6 +761,53 @@ fn one_outlier_is_ignored_and_two_that_agree_are_believed() {
         .unwrap();
     assert_eq!(carried.status, Status::Tracking);
     assert!(error_m(&carried, &elsewhere) < 0.01);
+}
+
+/// Oracle: the contract: at two images per second, one motion of visual odometry is 0.4 m off. The located
+/// view contradicts it, but not the motion prior: the view is used at once.
+#[test]
+fn a_located_view_prevails_over_wrong_visual_odometry() {
+    let filter = filter();
+    let mut state = filter.start(None);
+    for number in 1..=20 {
+        let (last, this) = (path(15 * (number - 1)), path(15 * number));
+        let wrong_m = if number == 15 { 0.4 } else { 0.0 };
+        let observed = ViewObservation {
+            time_ns: number as i64 * 15 * PERIOD_NS,
+            visual: (number > 1).then(|| VisualMotion {
+                motion: last.inv_mul(&this) * Pose::translation(wrong_m, 0.0, 0.0),
+                ..visual(2)
+            }),
+            ..view(number, Some(this))
+        };
+        let update = filter.observe(&mut state, &observed).unwrap();
+        if number > 2 {
+            assert!(error_m(&update, &this) < 0.02, "{number}");
+            assert_eq!(update.status, Status::Tracking, "{}", update.reason);
+        }
+    }
+}
+
+/// Oracle: the contract: timestamps in milliseconds that are read as nanoseconds make every motion a
+/// contradiction. The reason says what to look at.
+#[test]
+fn timestamps_in_a_wrong_unit_are_suspected() {
+    let filter = filter();
+    let mut state = filter.start(None);
+    for number in 1..=30 {
+        let observed = ViewObservation {
+            time_ns: number as i64 * 33,
+            ..view(number, Some(path(number * 3)))
+        };
+        let update = filter.observe(&mut state, &observed).unwrap();
+        assert_eq!(update.status, Status::Relocalizing);
+        assert_eq!(
+            update.reason.contains("timestamps"),
+            number > 1,
+            "{}",
+            update.reason
+        );
+    }
 }
 
 /// Oracle: the contract: an image that repeats holds nothing new; six in a row are a frozen camera. A

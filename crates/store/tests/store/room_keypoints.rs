@@ -436,7 +436,7 @@ async fn parameters_of_tracking_are_published_with_a_room() {
     let parameters = FilterParameters {
         process_noise_factor: 7.0,
         visual_noise: MotionNoise {
-            over_radian: 0.125,
+            over_motion: 0.125,
             ..MotionNoise::IMAGES
         },
         // A setting of one stream, which is not stored.
