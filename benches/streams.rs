@@ -1,11 +1,12 @@
 //! How many cameras one machine follows over loopback. Clients and server share the machine.
 //!
-//! - `cargo bench --bench streams -- [STREAMS] [HZ] [SECONDS]`: streams of 768-column features, 1,000 at
-//!   10 Hz for 20 s by default, beside a server that answers the same messages without processing them.
-//! - `cargo bench --features full --bench streams -- [STREAMS] [HZ] [SECONDS] --images STORE ROOM FOLDER
-//!   MODEL`: streams of the images in FOLDER, 8 at 10 Hz for 20 s by default, in a room with keypoints
-//!   of the encoder MODEL; beside the encoder alone, on one image and on eight at a time. onnxruntime if
-//!   ORT_DYLIB_PATH names its library.
+//! - `cargo bench --bench streams -- [STREAMS] [HZ] [SECONDS]`: streams of 768-column features,
+//!   1,000 at 10 Hz for 20 s by default, beside a server that answers the same messages without
+//!   processing them.
+//! - `cargo bench --features full --bench streams -- [STREAMS] [HZ] [SECONDS] --images STORE ROOM
+//!   FOLDER MODEL`: streams of the images in FOLDER, 8 at 10 Hz for 20 s by default, in a room with
+//!   keypoints of the encoder MODEL; beside the encoder alone, on one image and on eight at a time.
+//!   onnxruntime if ORT_DYLIB_PATH names its library.
 #![allow(
     missing_docs,
     clippy::unwrap_used,

@@ -22,8 +22,8 @@ pub struct Export {
 
 #[derive(Debug, Subcommand)]
 enum Format {
-    /// A folder with poses.npy, timestamps.npy, frame_ids.npy, features_NAME.npy, bundle.json and, if
-    /// the room has keypoints, keypoint_*.npy
+    /// A folder with poses.npy, timestamps.npy, frame_ids.npy, features_NAME.npy, bundle.json and,
+    /// if the room has keypoints, keypoint_*.npy
     Numpy(From),
     /// A TUM trajectory file, "timestamp tx ty tz qx qy qz qw" per line: seconds, meters,
     /// world_from_camera

@@ -32,7 +32,8 @@ pub struct FitTracking {
     /// Which frames are mapped and which are tracked
     #[arg(long, value_parser = one_of::<HoldOut>(), default_value = "blocks")]
     hold_out: HoldOut,
-    /// Publish the parameters with each of --room. Servers then use them for streams that name the room
+    /// Publish the parameters with each of --room. Servers then use them for streams that name the
+    /// room
     #[arg(long)]
     publish: bool,
     #[command(flatten)]

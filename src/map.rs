@@ -1,4 +1,5 @@
-//! `seese3 map`: parts of rooms, other world frames, and joined rooms. Each command publishes a new room.
+//! `seese3 map`: parts of rooms, other world frames, and joined rooms. Each command publishes a new
+//! room.
 
 use std::path::{Path, PathBuf};
 
@@ -69,7 +70,8 @@ struct Crop {
 struct Transform {
     #[command(flatten)]
     common: Common,
-    /// A text file with a 4x4 matrix, new_from_old, meters: a rotation times a scale, and a translation
+    /// A text file with a 4x4 matrix, new_from_old, meters: a rotation times a scale, and a
+    /// translation
     #[arg(long, value_name = "FILE")]
     matrix: PathBuf,
 }
@@ -93,7 +95,8 @@ struct Merge {
     /// The room whose frames are added
     #[arg(long)]
     add: String,
-    /// Align the added room first, by the keypoints that both show; otherwise both are in one world frame
+    /// Align the added room first, by the keypoints that both show; otherwise both are in one world
+    /// frame
     #[arg(long)]
     align: bool,
     /// Estimate the scale of the added room, too

@@ -16,8 +16,8 @@ use seese3_data::pose_check::{
 };
 use seese3_encoder::{image_size, read_image};
 
-/// Ratio of the median epipolar errors of the stated and the fitted camera from which the fitted one
-/// is suggested.
+/// Ratio of the median epipolar errors of the stated and the fitted camera from which the fitted
+/// one is suggested.
 const BETTER_CAMERA_RATIO: f64 = 1.1;
 
 /// Origin of the poses that are compared with the images.

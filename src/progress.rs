@@ -88,7 +88,8 @@ fn seconds_left(seconds: u64, position: u64, length: u64) -> Option<u64> {
 mod tests {
     use super::seconds_left;
 
-    /// Oracle: by hand. Two of four items in 120 s leave 120 s; before the first item, nothing is known.
+    /// Oracle: by hand. Two of four items in 120 s leave 120 s; before the first item, nothing is
+    /// known.
     #[test]
     fn the_time_left_is_that_of_the_mean_speed() {
         assert_eq!(seconds_left(120, 2, 4), Some(120));

@@ -152,13 +152,13 @@ pub struct Serve {
     /// and tokens are invalid after the server stops
     #[arg(long, value_name = "FILE", env = "SEESE3_TOKEN_KEY_FILE")]
     token_key_file: Option<PathBuf>,
-    /// Threads of each of three pools, 1 to 1024: short requests, requests with images, and batches,
-    /// evaluations and fits, which get half as many, rounded up. Also the number of threads of an
-    /// onnxruntime session. The number of cores if omitted
+    /// Threads of each of three pools, 1 to 1024: short requests, requests with images, and
+    /// batches, evaluations and fits, which get half as many, rounded up. Also the number of
+    /// threads of an onnxruntime session. The number of cores if omitted
     #[arg(long, env = "SEESE3_THREADS", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
-    /// Maximum number of waiting requests in each thread pool (see --threads), 0 to 1000000; further
-    /// ones are refused
+    /// Maximum number of waiting requests in each thread pool (see --threads), 0 to 1000000;
+    /// further ones are refused
     #[arg(long, env = "SEESE3_QUEUE", default_value_t = Config::default().queue, value_parser = bounded(0, 1_000_000))]
     queue: usize,
     /// Format of the log, which goes to standard error; RUST_LOG filters it

@@ -42,8 +42,8 @@ pub struct Studio {
     /// Kind of rooms and of their recordings
     #[arg(long, default_value = "visits", value_parser = one_of::<Suite>())]
     suite: Suite,
-    /// Variations that are turned off in the suites `visits` and `returns`, separated by commas, for
-    /// ablations; the poses stay the same
+    /// Variations that are turned off in the suites `visits` and `returns`, separated by commas,
+    /// for ablations; the poses stay the same
     #[arg(long, value_delimiter = ',', value_name = "VARIATIONS", value_parser = one_of::<Variation>())]
     without: Vec<Variation>,
     /// Number of rooms, 1 to 100000

@@ -1,6 +1,6 @@
 //! The architecture, as far as Cargo does not enforce it: inside a crate, a module uses only those
-//! above its line in `lib.rs`, and no two modules of a folder use each other; formats and the outside
-//! world have one home each.
+//! above its line in `lib.rs`, and no two modules of a folder use each other; formats and the
+//! outside world have one home each.
 #![allow(
     missing_docs,
     clippy::unwrap_used,
@@ -323,7 +323,8 @@ fn a_module_uses_only_those_above_it() {
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
-/// Oracle: a graph without cycles can be emptied by taking away, again and again, what uses nothing.
+/// Oracle: a graph without cycles can be emptied by taking away, again and again, what uses
+/// nothing.
 #[test]
 fn modules_of_a_folder_do_not_use_each_other_in_circles() {
     let mut wrong = Vec::new();

@@ -26,8 +26,8 @@ pub struct Localize {
     frame: Option<u32>,
     #[command(flatten)]
     feature: FeatureRow,
-    /// Camera of --image, as --camera of `seese3 import`, or "mapping" for the camera that mapped the
-    /// room. Required if the room has keypoints
+    /// Camera of --image, as --camera of `seese3 import`, or "mapping" for the camera that mapped
+    /// the room. Required if the room has keypoints
     #[arg(long, value_name = CAMERA_FORM, requires = "image")]
     camera: Option<ViewCamera>,
     /// Number of frames returned, over all rooms, best first

@@ -41,8 +41,8 @@ pub struct Motion {
     /// Two JPEG or PNG files, A,B; the server must have been started with --encoder
     #[arg(long, value_delimiter = ',', value_name = "A,B", conflicts_with_all = ["frames", "feature"])]
     images: Option<Vec<PathBuf>>,
-    /// Camera of --images, as --camera of `seese3 import`. With it, a server with the encoder of a room's
-    /// keypoints matches the keypoints of the images, unless --adapter is given
+    /// Camera of --images, as --camera of `seese3 import`. With it, a server with the encoder of a
+    /// room's keypoints matches the keypoints of the images, unless --adapter is given
     #[arg(long, value_name = CAMERA_FORM, requires = "images")]
     camera: Option<CameraOption>,
     /// A NumPy file of features, shape (n, d); --rows chooses two

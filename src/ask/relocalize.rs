@@ -31,8 +31,8 @@ pub struct Relocalize {
         conflicts_with = "features"
     )]
     images: Vec<PathBuf>,
-    /// Camera of --images, as --camera of `seese3 import`, or "mapping" for the camera that mapped the
-    /// room. Required if a room has keypoints
+    /// Camera of --images, as --camera of `seese3 import`, or "mapping" for the camera that mapped
+    /// the room. Required if a room has keypoints
     #[arg(long, value_name = CAMERA_FORM, requires = "images")]
     camera: Option<ViewCamera>,
     /// A NumPy file of features, shape (n, d); --rows chooses some

@@ -24,8 +24,8 @@ pub struct Motion {
     /// The adapter
     #[arg(long, required_unless_present = "keypoints")]
     adapter: Option<String>,
-    /// Also estimate each motion by the matched keypoints of both views, without a map and an adapter. The
-    /// room needs keypoints
+    /// Also estimate each motion by the matched keypoints of both views, without a map and an
+    /// adapter. The room needs keypoints
     #[arg(long)]
     keypoints: bool,
     /// Frames from the first view to the second

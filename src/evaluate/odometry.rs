@@ -32,8 +32,8 @@ pub struct Odometry {
     /// The rooms: names, or patterns with *
     #[arg(long = "room", required = true)]
     rooms: Vec<String>,
-    /// The adapter; it must be calibrated (`train --calibrate-on`), but in none of these rooms. Without
-    /// one, matched keypoints alone track the camera, in rooms with keypoints
+    /// The adapter; it must be calibrated (`train --calibrate-on`), but in none of these rooms.
+    /// Without one, matched keypoints alone track the camera, in rooms with keypoints
     #[arg(long)]
     adapter: Option<String>,
     /// Which frames are mapped and which are replayed
@@ -53,8 +53,8 @@ pub struct Odometry {
     /// ROOM.odom
     #[arg(long)]
     paths: Option<PathBuf>,
-    /// Parameters of the filter: a file of `fit-tracking --json`. By default those that were published with
-    /// a room, if any
+    /// Parameters of the filter: a file of `fit-tracking --json`. By default those that were
+    /// published with a room, if any
     #[arg(long, value_name = "FILE")]
     parameters: Option<PathBuf>,
     /// Print a line for every room, not only the mean

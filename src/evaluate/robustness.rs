@@ -35,8 +35,8 @@ pub struct Robustness {
     /// The rooms, imported with images: names, or patterns with *
     #[arg(long = "room", required = true)]
     rooms: Vec<String>,
-    /// The adapter; it must be calibrated (`train --calibrate-on`), but in none of these rooms. Without
-    /// one, matched keypoints alone track the camera, in rooms with keypoints
+    /// The adapter; it must be calibrated (`train --calibrate-on`), but in none of these rooms.
+    /// Without one, matched keypoints alone track the camera, in rooms with keypoints
     #[arg(long, requires = "encoder")]
     adapter: Option<String>,
     /// The encoder that the adapter was trained on: an ONNX file, `pixels` or `builtin`
@@ -269,8 +269,8 @@ struct DisturbedCamera<'a> {
 }
 
 impl DisturbedCamera<'_> {
-    /// Encodes the images that the disturbance changes. `take` gets the row of a frame among the tracked
-    /// ones, its encoding, and whether the image is blank.
+    /// Encodes the images that the disturbance changes. `take` gets the row of a frame among the
+    /// tracked ones, its encoding, and whether the image is blank.
     fn each_changed(
         &self,
         room: &Room,

@@ -64,8 +64,8 @@ impl<'a> RoomImages<'a> {
     }
 }
 
-/// The film of a room that `seese3 studio` drew, by its name, format and poses; `None` if the room is
-/// not one.
+/// The film of a room that `seese3 studio` drew, by its name, format and poses; `None` if the room
+/// is not one.
 fn film(room: &Room) -> Option<Film> {
     let (seed, number) = room.id().as_str().strip_prefix("studio")?.split_once('-')?;
     let seed = seed.parse().ok()?;

@@ -33,9 +33,9 @@ pub struct Destination {
     /// Keep every K-th usable frame of each sequence
     #[arg(long, value_name = "K", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
-    /// Fail and publish nothing, instead of warning. Reasons: an unusable frame; an unreadable image;
-    /// wrong poses (contradicted by the images, all identical, identities from lost tracking, steps
-    /// too long for meters, timestamps that do not increase)
+    /// Fail and publish nothing, instead of warning. Reasons: an unusable frame; an unreadable
+    /// image; wrong poses (contradicted by the images, all identical, identities from lost
+    /// tracking, steps too long for meters, timestamps that do not increase)
     #[arg(long)]
     strict: bool,
     /// Publish a new revision even if the store has a room of this name with other frames; the

@@ -91,8 +91,8 @@ struct Colmap {
     /// Folder that the image names are relative to; searched next to the model if omitted
     #[arg(long, value_name = "DIR")]
     images: Option<PathBuf>,
-    /// Images per second of the video: the last number in the name of an image is its place in it. A room
-    /// without times counts as one of 30 images per second
+    /// Images per second of the video: the last number in the name of an image is its place in it.
+    /// A room without times counts as one of 30 images per second
     #[arg(long, value_name = "HZ", value_parser = above_zero)]
     rate: Option<f64>,
     /// Times of the images: a file with the lines SECONDS NAME

@@ -28,8 +28,8 @@ const WAITING: usize = 32;
 pub struct Track {
     #[command(flatten)]
     server: Server,
-    /// Name of the room; if omitted, the server finds it among all rooms that the adapter fits or, for
-    /// images if no adapter can track, among all rooms with keypoints
+    /// Name of the room; if omitted, the server finds it among all rooms that the adapter fits or,
+    /// for images if no adapter can track, among all rooms with keypoints
     #[arg(long)]
     room: Option<String>,
     /// Name of the adapter; if omitted, the newest that can track in the room, or without a room
@@ -43,8 +43,8 @@ pub struct Track {
     /// have been started with --encoder
     #[arg(long, value_name = "FOLDER", conflicts_with = "feature")]
     images: Option<PathBuf>,
-    /// Camera of --images, as --camera of `seese3 import`, or "mapping" for the camera that mapped the
-    /// room. In a room with keypoints, the focal length of an unknown camera is estimated
+    /// Camera of --images, as --camera of `seese3 import`, or "mapping" for the camera that mapped
+    /// the room. In a room with keypoints, the focal length of an unknown camera is estimated
     #[arg(long, value_name = CAMERA_FORM, requires = "images")]
     camera: Option<ViewCamera>,
     /// First frame to send, counted from 0

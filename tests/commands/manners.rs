@@ -1,5 +1,5 @@
-//! What every command keeps to: JSON on standard output stands alone, `--quiet` is quiet, and files of
-//! results are what their names say.
+//! What every command keeps to: JSON on standard output stands alone, `--quiet` is quiet, and files
+//! of results are what their names say.
 
 use crate::basics::imported;
 use crate::program::{Place, said};

@@ -70,8 +70,8 @@ fn pose_of(answer: &Value) -> Pose {
     )
 }
 
-/// Oracle: the recorded pose of the frame; the true focal length, 525 pixels; a view of a drawn room,
-/// which is not in the kitchen.
+/// Oracle: the recorded pose of the frame; the true focal length, 525 pixels; a view of a drawn
+/// room, which is not in the kitchen.
 #[test]
 #[ignore = "needs the folder of large inputs: SEESE3_SHARED or ../shared"]
 fn a_view_is_located_by_its_keypoints_without_an_adapter() {
@@ -165,8 +165,8 @@ fn a_view_is_located_by_its_keypoints_without_an_adapter() {
     );
 }
 
-/// Oracle: the recorded poses of the frames, none of which is mapped. The adapter of the room is not
-/// calibrated, so keypoints alone track the camera.
+/// Oracle: the recorded poses of the frames, none of which is mapped. The adapter of the room is
+/// not calibrated, so keypoints alone track the camera.
 fn tracks_without_an_adapter(here: &Place, to: &str) {
     let kitchen = shared().join("rooms/kitchen");
     fs::create_dir(here.file("stream")).unwrap();

@@ -300,8 +300,8 @@ fn models_need_a_build_that_can_run_them() {
     }
 }
 
-/// A folder of one's own: images of a far wall of waves that a camera turns before, and poses that say
-/// so, or their inverse.
+/// A folder of one's own: images of a far wall of waves that a camera turns before, and poses that
+/// say so, or their inverse.
 fn looking_about(folder: &Path, is_inverted: bool) {
     std::fs::create_dir_all(folder.join("images")).unwrap();
     let mut poses = Array3::zeros((60, 4, 4));

@@ -56,8 +56,8 @@ impl Collector {
     }
 }
 
-/// Oracle: W3C Trace Context and OpenTelemetry's own messages: a request that comes with a trace is a
-/// span of that trace, below the caller's, with its RPC and how it ended.
+/// Oracle: W3C Trace Context and OpenTelemetry's own messages: a request that comes with a trace is
+/// a span of that trace, below the caller's, with its RPC and how it ended.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn requests_are_spans_of_their_callers_traces() {
     let collector = Collector::default();

@@ -1,4 +1,5 @@
-//! Newest-frame mode: a camera that is faster than the server skips frames instead of falling behind.
+//! Newest-frame mode: a camera that is faster than the server skips frames instead of falling
+//! behind.
 
 use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};

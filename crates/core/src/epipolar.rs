@@ -155,8 +155,8 @@ impl EpipolarPairs {
     /// Fits the focal length and the first radial coefficient, starting from `stated`.
     ///
     /// # Errors
-    /// [`Error::TooFewMatches`] under 200 matches, [`Error::OutOfRange`] if the fit leaves the range
-    /// of cameras.
+    /// [`Error::TooFewMatches`] under 200 matches, [`Error::OutOfRange`] if the fit leaves the
+    /// range of cameras.
     pub fn fit(&self, stated: &CameraIntrinsics) -> Result<CameraFit, Error> {
         let matches = self.match_count();
         if matches < MIN_FIT_MATCHES {

@@ -126,8 +126,8 @@ impl Keypoints {
 mod tests {
     use super::*;
 
-    /// Oracle: the definition, worked by hand. ±0.5 is ±127, larger numbers are clamped, and the best
-    /// score comes first.
+    /// Oracle: the definition, worked by hand. ±0.5 is ±127, larger numbers are clamped, and the
+    /// best score comes first.
     #[test]
     fn keypoints_are_sorted_and_quantized() {
         let points = [[0.1, 0.2].into(), [0.3, 0.4].into(), [0.5, 0.6].into()];

@@ -31,8 +31,8 @@
 //!
 //! # The map
 //!
-//! The modules are listed from the lowest layer up: each uses only those listed before it, and a test
-//! enforces it.
+//! The modules are listed from the lowest layer up: each uses only those listed before it, and a
+//! test enforces it.
 //!
 //! | module | what |
 //! | --- | --- |

@@ -264,8 +264,8 @@ mod tests {
         Ok(KeypointMaps::new(positions, reliability, descriptors)?.detect())
     }
 
-    /// Oracle: the definition in NumPy and SciPy (`tests/golden/keypoints`). A descriptor has 8 bits
-    /// with steps of 1/254, and numbers beyond ±0.5 are clamped.
+    /// Oracle: the definition in NumPy and SciPy (`tests/golden/keypoints`). A descriptor has 8
+    /// bits with steps of 1/254, and numbers beyond ±0.5 are clamped.
     #[test]
     fn keypoints_are_those_of_the_definition() {
         let found = detected(&outputs()).unwrap();
@@ -294,8 +294,9 @@ mod tests {
         }
     }
 
-    /// Oracle: the definition. A keypoint needs a probability above 0.02, so none is found where all
-    /// pixels are less probable, where the probabilities are not numbers, or in too small a map.
+    /// Oracle: the definition. A keypoint needs a probability above 0.02, so none is found where
+    /// all pixels are less probable, where the probabilities are not numbers, or in too small a
+    /// map.
     #[test]
     fn blank_and_broken_outputs_give_no_keypoints() {
         for value in [0.0, 1.0 / 65.0, f32::NAN] {

@@ -276,8 +276,8 @@ mod tests {
         }
     }
 
-    /// Oracle: what transformers 5.23 writes for DINOv2's and DINOv3's processors, and the recipes of
-    /// these two, which were read in the code of their authors.
+    /// Oracle: what transformers 5.23 writes for DINOv2's and DINOv3's processors, and the recipes
+    /// of these two, which were read in the code of their authors.
     #[test]
     fn files_of_transformers_say_what_the_recipes_say() {
         let dinov2 = br#"{"crop_size": {"height": 224, "width": 224}, "do_center_crop": true, "do_convert_rgb": true,

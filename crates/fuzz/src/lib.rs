@@ -1,1 +1,2 @@
-//! Tests every parser of untrusted input with mutated files: `cargo test -p seese3-fuzz`. `tests/mutations.rs` has the targets.
+//! Tests every parser of untrusted input with mutated files: `cargo test -p seese3-fuzz`.
+//! `tests/mutations.rs` has the targets.

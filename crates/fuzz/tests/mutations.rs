@@ -1,9 +1,9 @@
-//! Every parser of outside bytes, given files that were valid once: bits flipped, parts cut, doubled,
-//! overwritten with extremes. Anything but an answer or an error is a defect: a panic, an abort, an
-//! endless loop, memory without bound.
+//! Every parser of outside bytes, given files that were valid once: bits flipped, parts cut,
+//! doubled, overwritten with extremes. Anything but an answer or an error is a defect: a panic, an
+//! abort, an endless loop, memory without bound.
 //!
-//! Each parser gets half a second, or SEESE3_FUZZ_SECONDS; `just fuzz` gives ten minutes. A file that
-//! makes a parser panic is written beside the test program, and its name is printed.
+//! Each parser gets half a second, or SEESE3_FUZZ_SECONDS; `just fuzz` gives ten minutes. A file
+//! that makes a parser panic is written beside the test program, and its name is printed.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;

@@ -9,12 +9,13 @@ use nalgebra::{Matrix3, SMatrix, UnitQuaternion, Vector3};
 
 use seese3_core::geometry::Pose;
 
-/// Magnitude of gravity, m/s². Its regional deviation, at most 0.03 m/s², is part of the accelerometer's bias.
+/// Magnitude of gravity, m/s². Its regional deviation, at most 0.03 m/s², is part of the
+/// accelerometer's bias.
 pub const GRAVITY_M_S2: f64 = 9.806_65;
 /// Longest interval between samples that is integrated over, seconds.
 const MAX_INTERVAL_S: f64 = 0.1;
-/// Shortest interval between samples from which an angular acceleration is computed, seconds: over a
-/// shorter one it would be noise.
+/// Shortest interval between samples from which an angular acceleration is computed, seconds: over
+/// a shorter one it would be noise.
 const LEAST_INTERVAL_S: f64 = 5e-4;
 /// Maximum number of samples that wait for the next frame.
 const MAX_SAMPLES: usize = 20_000;
@@ -93,8 +94,8 @@ impl InertialMount {
 }
 
 /// The integrated samples between two frames, for biases of zero. With the velocity v and the
-/// gravity g at the first frame, in its axes, the camera moves by v t + g t²/2 + `position`, and its
-/// velocity changes by g t + `velocity`.
+/// gravity g at the first frame, in its axes, the camera moves by v t + g t²/2 + `position`, and
+/// its velocity changes by g t + `velocity`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct InertialMotion {
     /// Time between the frames.
@@ -109,8 +110,8 @@ pub struct InertialMotion {
     pub last_rate: Vector3<f64>,
     /// Variance of each of its components.
     pub last_rate_variance: f64,
-    /// Derivatives of (position, rotation, velocity) by the biases of gyroscope and accelerometer. The
-    /// rotation's is in the axes of the second frame.
+    /// Derivatives of (position, rotation, velocity) by the biases of gyroscope and accelerometer.
+    /// The rotation's is in the axes of the second frame.
     pub by_bias: SMatrix<f64, 9, 6>,
     /// Covariance of the errors of (position, rotation, velocity) by white noise.
     pub covariance: SMatrix<f64, 9, 9>,

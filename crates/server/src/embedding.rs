@@ -1,5 +1,5 @@
-//! Embedding of the views in requests: features, latents, images and stored frames to latents of one
-//! adapter.
+//! Embedding of the views in requests: features, latents, images and stored frames to latents of
+//! one adapter.
 
 use std::sync::Arc;
 

@@ -174,8 +174,8 @@ impl<'a> ImageView<'a> {
     ///
     /// # Errors
     /// [`Error::Invalid`] on the camera if the matches contradict it, or on the image if it has not
-    /// the aspect ratio of the only room's camera; [`Error::Precondition`] if a named room cannot be
-    /// loaded; [`Error::Cancelled`] once `cancel` is set.
+    /// the aspect ratio of the only room's camera; [`Error::Precondition`] if a named room cannot
+    /// be loaded; [`Error::Cancelled`] once `cancel` is set.
     pub fn matched(
         &self,
         rooms: &[Arc<ServedRoom>],
@@ -203,8 +203,9 @@ impl<'a> ImageView<'a> {
         }
     }
 
-    /// Matches the image with a room. `None` if the room has no keypoints, this server no encoder for
-    /// them, or, unless it `is_only` one, the mapping camera another aspect ratio than the image.
+    /// Matches the image with a room. `None` if the room has no keypoints, this server no encoder
+    /// for them, or, unless it `is_only` one, the mapping camera another aspect ratio than the
+    /// image.
     fn matched_with(
         &self,
         room: &ServedRoom,

@@ -393,7 +393,8 @@ impl LocatedPose {
     }
 }
 
-/// Why a view is not located in a room. `unmatched` is why its keypoints do not, if they were tried.
+/// Why a view is not located in a room. `unmatched` is why its keypoints do not, if they were
+/// tried.
 fn reason_of(unmatched: Option<NotLocated>) -> String {
     match unmatched {
         None => "the view is not in the map: it resembles none of its frames".to_owned(),

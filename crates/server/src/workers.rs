@@ -159,7 +159,8 @@ impl Workers {
     }
 
     /// Runs work on a blocking thread that was admitted elsewhere: a frame of a stream, an image of
-    /// an upload, a fit. It waits for a thread without limit, is never refused, and is not cancelled.
+    /// an upload, a fit. It waits for a thread without limit, is never refused, and is not
+    /// cancelled.
     ///
     /// # Errors
     /// [`Error::Loading`] if the stopping server abandoned the work, [`Error::Internal`] if it

@@ -50,8 +50,8 @@ impl Store {
             .await
     }
 
-    /// Appends the frames of `addition`, with their features and keypoints, to the newest revision of
-    /// the room of the same name. Publishes nothing.
+    /// Appends the frames of `addition`, with their features and keypoints, to the newest revision
+    /// of the room of the same name. Publishes nothing.
     ///
     /// The added frames are separate sequences. The result has no image paths, because the added
     /// frames have none. Known frames keep their keypoints.
@@ -207,9 +207,9 @@ pub(super) fn extended(
     })
 }
 
-/// The keypoints of the room with those of the added frames, which are in `rows` of the joined room.
-/// Frames without keypoints are among them if only the room or only the addition has keypoints; `None`
-/// if neither has.
+/// The keypoints of the room with those of the added frames, which are in `rows` of the joined
+/// room. Frames without keypoints are among them if only the room or only the addition has
+/// keypoints; `None` if neither has.
 fn joined_keypoints(
     base: &StoredRoom,
     rows: Range<usize>,

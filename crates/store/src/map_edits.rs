@@ -83,8 +83,8 @@ impl EditedRoom {
         })
     }
 
-    /// The frames of this room, then those of another one in the same world frame, as sequences of their
-    /// own. The result has no image paths.
+    /// The frames of this room, then those of another one in the same world frame, as sequences of
+    /// their own. The result has no image paths.
     ///
     /// # Errors
     /// [`Error::CannotAdd`] if cameras, features or keypoints do not fit together.
@@ -140,8 +140,8 @@ impl EditedRoom {
     }
 }
 
-/// Sequence numbers of some rows of a room, which change wherever a row is left out or the room begins
-/// another sequence.
+/// Sequence numbers of some rows of a room, which change wherever a row is left out or the room
+/// begins another sequence.
 fn sequences(room: &Room, rows: &[usize]) -> Vec<u32> {
     let mut number = 0;
     let mut sequences = Vec::with_capacity(rows.len());

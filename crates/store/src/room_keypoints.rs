@@ -1,7 +1,7 @@
 //! The keypoints of a room, and their file.
 //!
-//! The file has one entry per keypoint, frame after frame. A keypoint takes 39 bytes, so 300 of them
-//! take 11.7 kB.
+//! The file has one entry per keypoint, frame after frame. A keypoint takes 39 bytes, so 300 of
+//! them take 11.7 kB.
 
 use std::sync::Arc;
 
@@ -119,8 +119,8 @@ impl RoomKeypoints {
         keypoints_file(&self.map)
     }
 
-    /// Keypoints of `frame_count` frames from the bytes of [`RoomKeypoints::to_bytes`]. The bytes may
-    /// come from anywhere.
+    /// Keypoints of `frame_count` frames from the bytes of [`RoomKeypoints::to_bytes`]. The bytes
+    /// may come from anywhere.
     ///
     /// # Errors
     /// [`Error::Damaged`] if a number of the header or the bytes cannot be those of a map.

@@ -224,12 +224,12 @@ impl Store {
         self.publish_over(contents, PublishPolicy::SameFrames).await
     }
 
-    /// Publishes the newest revision of a room with other parameters of filters, or without any: that is
-    /// the next revision, unless they are the same.
+    /// Publishes the newest revision of a room with other parameters of filters, or without any:
+    /// that is the next revision, unless they are the same.
     ///
     /// # Errors
-    /// [`Error::TrackingParameters`] for parameters that no filter can have, [`Error::Unknown`] without the
-    /// room, [`Error::Contended`] if others keep publishing it.
+    /// [`Error::TrackingParameters`] for parameters that no filter can have, [`Error::Unknown`]
+    /// without the room, [`Error::Contended`] if others keep publishing it.
     pub async fn publish_tracking(
         &self,
         name: &str,

@@ -434,8 +434,8 @@ mod tests {
     }
 
     /// Oracle: the definition of a return. On average 40 to 70 % of the second visit's views are
-    /// near a view of the first visit, and 20 to 90 % in four of five rooms; a visit on its own path
-    /// has fewer. Else the suites are the same: the first visits, light and cameras.
+    /// near a view of the first visit, and 20 to 90 % in four of five rooms; a visit on its own
+    /// path has fewer. Else the suites are the same: the first visits, light and cameras.
     #[test]
     fn who_returns_sees_about_half_of_the_views_again() {
         let mut shares = [Vec::new(), Vec::new()];

@@ -1,4 +1,5 @@
-//! A scene of points with known positions and descriptors, and the keypoints that cameras see of it.
+//! A scene of points with known positions and descriptors, and the keypoints that cameras see of
+//! it.
 
 use nalgebra::{Point3, Vector2, Vector3};
 use ndarray::Array2;

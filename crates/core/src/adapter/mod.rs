@@ -4,9 +4,8 @@
 //! - φ is a small network (d → 64 → 20) and W (6×20) a matrix without bias: ΔP ≈ σ ⊙ W(φ(z₂) −
 //!   φ(z₁)) + μ. One φ with its W is a chart; a mixture has several, combined by a gating
 //!   network or evenly (an ensemble).
-//! - μ and σ are the mean and the population standard deviation (ddof 0; A-11 in `docs/paper.md`) of the
-//!   training
-//!   twists, for each component of (v, ω).
+//! - μ and σ are the mean and the population standard deviation (ddof 0; A-11 in `docs/paper.md`)
+//!   of the training twists, for each component of (v, ω).
 //! - Weights are trained and stored in f32; every answer is computed in f64.
 
 mod attention;

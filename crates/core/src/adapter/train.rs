@@ -266,9 +266,9 @@ pub fn train(
     Mixture::even(charts)
 }
 
-/// Continues the training of a single-chart network; `samples` must be scaled
-/// with the μ and σ that the network was trained with. Widths and charts of `config` are ignored; the seed sets the sample order and
-/// the noise.
+/// Continues the training of a single-chart network; `samples` must be scaled with the μ and σ that
+/// the network was trained with. Widths and charts of `config` are ignored; the seed sets the
+/// sample order and the noise.
 ///
 /// # Errors
 /// [`Error::Diverged`] when the loss is not finite, [`Error::Charts`] when the network has more

@@ -344,8 +344,8 @@ impl Adapter {
 
     /// The latent step of a motion from `latent` by a corrector. A residual corrector adds its
     /// output to W⁺ΔP in the affine reading; the linear one predicts the target latent, and the
-    /// source latent is subtracted. If a motion is divided into parts, call this for each part: each gets
-    /// the whole μ, because μ is part of the corrector's input and cannot be divided.
+    /// source latent is subtracted. If a motion is divided into parts, call this for each part:
+    /// each gets the whole μ, because μ is part of the corrector's input and cannot be divided.
     ///
     /// # Errors
     /// [`Error::NoCorrector`] when the adapter has no corrector of this kind.

@@ -365,8 +365,8 @@ impl CameraIntrinsics {
         })
     }
 
-    /// Derivative of [`Self::to_image_plane`] by the image point, at a point of the plane; zero where
-    /// the distortion has no inverse.
+    /// Derivative of [`Self::to_image_plane`] by the image point, at a point of the plane; zero
+    /// where the distortion has no inverse.
     pub(crate) fn plane_derivative(&self, plane: Vector2<f64>) -> Matrix2<f64> {
         let (_, derivative) = self.distortion.distort(plane);
         let by_plane = Matrix2::from_diagonal(&self.focal) * derivative;

@@ -1,12 +1,12 @@
-//! Inverse Poincaré navigation: for a source (a frame, a feature or a latent) and a requested camera
-//! motion, retrieve the frames that the camera would see, in one step or several.
+//! Inverse Poincaré navigation: for a source (a frame, a feature or a latent) and a requested
+//! camera motion, retrieve the frames that the camera would see, in one step or several.
 //!
 //! - A step in latent space is ĝ = g + W⁺ΔP in one of three readings ([`Reading`], A-16), or the
 //!   step of another [`Stepper`]. The stored frames nearest to ĝ under a [`RetrievalMetric`] are
 //!   retrieved.
 //! - Steps are chained in one of three modes. Open loop adds all steps in latent space. Snap
-//!   continues from the latent of the nearest frame that each step retrieved. Closed loop also recomputes the remaining
-//!   motion from that frame's pose.
+//!   continues from the latent of the nearest frame that each step retrieved. Closed loop also
+//!   recomputes the remaining motion from that frame's pose.
 //! - Start reading at [`Navigator::answer`]; [`walk`] is the loop inside it.
 
 mod kind;

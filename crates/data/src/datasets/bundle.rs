@@ -75,8 +75,8 @@ pub struct BundleContents<'a> {
 pub struct KeypointArrays {
     /// `keypoint_counts.npy`: number of keypoints of each frame, shape (n).
     pub counts: Array1<i64>,
-    /// `keypoint_positions.npy`: fractions of the image's width and height from its top left corner,
-    /// shape (k, 2).
+    /// `keypoint_positions.npy`: fractions of the image's width and height from its top left
+    /// corner, shape (k, 2).
     pub positions: Array2<f32>,
     /// `keypoint_inverse_depths.npy`: 1 / z in the camera frame, per meter, shape (k).
     pub inverse_depths: Array1<f32>,
@@ -86,8 +86,8 @@ pub struct KeypointArrays {
     pub descriptors: Array2<i8>,
     /// `keypoint_basis_mean.npy`: compression subtracts it from a descriptor, shape (d).
     pub basis_mean: Array1<f32>,
-    /// `keypoint_basis_axes.npy`: compression then multiplies by it, and scales to unit length, shape
-    /// (d, 32).
+    /// `keypoint_basis_axes.npy`: compression then multiplies by it, and scales to unit length,
+    /// shape (d, 32).
     pub basis_axes: Array2<f32>,
 }
 
@@ -272,7 +272,8 @@ fn with_sources(
 }
 
 /// Writes a room with its features and keypoints into a folder, which is created if necessary, and
-/// returns the files. `bundle.json` is written last, so a folder without it is not a complete export.
+/// returns the files. `bundle.json` is written last, so a folder without it is not a complete
+/// export.
 ///
 /// # Errors
 /// [`Error::Io`] if a file cannot be written; [`Error::Malformed`] if the folder is not empty.

@@ -2,8 +2,9 @@
 //!
 //! Readers convert from the convention that a format defines to `world_from_camera`, meters,
 //! rotations on SO(3), with frames in order of capture. A recording that deviates from its format's
-//! convention is not noticed here; `import` applies `--poses`, `--convention` and `--scale` afterwards.
-//! Each format has a file or folder of its own; `collect` and `text` hold what most of them share.
+//! convention is not noticed here; `import` applies `--poses`, `--convention` and `--scale`
+//! afterwards. Each format has a file or folder of its own; `collect` and `text` hold what most of
+//! them share.
 
 mod arkitscenes;
 #[cfg(feature = "bags")]

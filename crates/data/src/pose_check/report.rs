@@ -13,8 +13,8 @@ use seese3_core::geometry::{CameraIntrinsics, Pose};
 use seese3_core::image::RgbImage;
 use seese3_core::room::{FrameId, Room};
 
-/// Usual distance of visible surfaces, metres. A fitted depth outside of it suggests another unit of
-/// length.
+/// Usual distance of visible surfaces, metres. A fitted depth outside of it suggests another unit
+/// of length.
 const USUAL_DEPTH_M: std::ops::Range<f64> = 0.4..40.0;
 /// Largest factor between the stated and the fitted focal length without a warning.
 const FOCAL_FACTOR: f64 = 1.4;

@@ -100,8 +100,8 @@ fn a_bag_of_ros_gives_the_poses_at_the_times_of_its_images() {
     }
 }
 
-/// Oracle: the same bag in one file. ROS 2 begins a new file after some time or size; its folder also
-/// holds a description.
+/// Oracle: the same bag in one file. ROS 2 begins a new file after some time or size; its folder
+/// also holds a description.
 #[test]
 fn a_bag_of_several_files_is_read_as_one() {
     let bag = tempfile::tempdir().unwrap();
@@ -328,8 +328,8 @@ impl Changed {
     }
 }
 
-/// Oracle: by hand. Messages 4, 7, 11, 17, 23, 27 and 29 are the compressed images, of which the last lies
-/// behind the last pose, and 1, 9, 13, 15, 19, 21 and 25 the odometry.
+/// Oracle: by hand. Messages 4, 7, 11, 17, 23, 27 and 29 are the compressed images, of which the
+/// last lies behind the last pose, and 1, 9, 13, 15, 19, 21 and 25 the odometry.
 #[test]
 fn a_bad_message_costs_its_own_frame() {
     let bad = "UPDATE messages SET data = x'00010000' WHERE id IN (11, 25)";
@@ -409,7 +409,8 @@ fn images_of_a_bag_never_replace_a_file() {
     assert!(compressed.join("000003.jpg").is_file());
 }
 
-/// The first chunk of the bag, with a size that no machine has, with another checksum, and as it is.
+/// The first chunk of the bag, with a size that no machine has, with another checksum, and as it
+/// is.
 #[test]
 fn a_chunk_that_lies_is_refused() {
     let whole = std::fs::read(folder("bag.mcap")).unwrap();

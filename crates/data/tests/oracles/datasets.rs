@@ -436,8 +436,8 @@ fn keypoints() -> KeypointArrays {
     }
 }
 
-/// Oracle: NumPy's own format, as the `ndarray-npy` crate reads it. A room without keypoints has no such
-/// file.
+/// Oracle: NumPy's own format, as the `ndarray-npy` crate reads it. A room without keypoints has no
+/// such file.
 #[test]
 fn exported_keypoints_are_arrays_of_numpy() {
     let out = tempfile::tempdir().unwrap();

@@ -100,7 +100,8 @@ fn colmap_models_are_read_in_both_forms() {
     }
 }
 
-/// Oracle: the numbers in the names of the images over the rate, and the lines of the file, by hand.
+/// Oracle: the numbers in the names of the images over the rate, and the lines of the file, by
+/// hand.
 #[test]
 fn a_colmap_model_takes_times() {
     let read = |times: &ImageTimes| {
@@ -212,7 +213,8 @@ fn kitti_poses_go_with_images_and_times() {
     assert!(error.to_string().contains("5 images"), "{error}");
 }
 
-/// Oracle: the poses from which NumPy and SciPy wrote the files, of a body that the camera is turned on.
+/// Oracle: the poses from which NumPy and SciPy wrote the files, of a body that the camera is
+/// turned on.
 #[test]
 fn euroc_poses_are_those_of_the_camera() {
     for path in ["euroc", "euroc/mav0"] {

@@ -34,9 +34,9 @@ fn path() -> Vec<Pose> {
     (0..300).map(pose).collect()
 }
 
-/// How the image moves between two poses: the similarity that fits best, by least squares, to where a
-/// pinhole camera sees points about three metres before it. It knows nothing of twists. `right` is 1, or
-/// -1 in an image that is mirrored.
+/// How the image moves between two poses: the similarity that fits best, by least squares, to where
+/// a pinhole camera sees points about three metres before it. It knows nothing of twists. `right`
+/// is 1, or -1 in an image that is mirrored.
 fn seen(first: &Pose, second: &Pose, right: f64, random: &mut ChaCha8Rng) -> ImageMotion {
     let mut moment = Matrix4::zeros();
     let mut product = Vector4::zeros();
@@ -343,8 +343,8 @@ fn the_facts_of_a_path_are_told() {
     assert_eq!(warnings(straight, back), [falls]);
 }
 
-/// Oracle: by hand: a recording whose camera never moves is wrong without a look at its images; of three
-/// images one has another size and none can be decoded, so the comparison has no pair.
+/// Oracle: by hand: a recording whose camera never moves is wrong without a look at its images; of
+/// three images one has another size and none can be decoded, so the comparison has no pair.
 #[test]
 fn one_call_checks_path_images_and_verdict() {
     let still = Frames {

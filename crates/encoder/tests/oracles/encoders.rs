@@ -371,8 +371,8 @@ fn a_layer_that_does_not_count_images_is_refused() {
     }
 }
 
-/// Oracle: NumPy, as for the same model in one file; and the definition of an identity: other weights
-/// are another encoder.
+/// Oracle: NumPy, as for the same model in one file; and the definition of an identity: other
+/// weights are another encoder.
 #[test]
 #[cfg_attr(
     not(any(feature = "onnx", feature = "onnxruntime")),
@@ -623,8 +623,8 @@ fn the_kitchens_photographs_give_its_features() {
 }
 
 /// Oracle: the detector's definition in NumPy on onnxruntime's outputs, of Pillow's image
-/// (`tests/golden/keypoints`). Decoder and resize filter differ by some levels of a pixel, so that a
-/// few weak keypoints differ.
+/// (`tests/golden/keypoints`). Decoder and resize filter differ by some levels of a pixel, so that
+/// a few weak keypoints differ.
 #[test]
 #[ignore = "needs the folder of large inputs: SEESE3_SHARED or ../shared"]
 fn the_keypoints_of_an_image_are_those_of_numpy() {

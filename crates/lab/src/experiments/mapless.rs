@@ -121,8 +121,8 @@ fn drift(paths: &[Paths]) -> Drift {
 }
 
 impl Paths {
-    /// The estimated path, with the distances from its beginning in the first part as long as the true
-    /// ones.
+    /// The estimated path, with the distances from its beginning in the first part as long as the
+    /// true ones.
     fn with_true_length(&self, views: &[PlayedView<'_>]) -> Self {
         let distance =
             |poses: &[Pose], row: usize| PoseError::between(&poses[0], &poses[row]).translation_m;

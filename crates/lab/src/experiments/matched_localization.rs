@@ -54,8 +54,8 @@ pub struct MatchedPart {
     pub n: usize,
     /// Matched views.
     pub ours: Answered,
-    /// Matched views that are looked for near a predicted pose, as while tracking: the true pose with a
-    /// drawn error of at most 0.03 m and 2° along each axis.
+    /// Matched views that are looked for near a predicted pose, as while tracking: the true pose
+    /// with a drawn error of at most 0.03 m and 2° along each axis.
     pub near_prediction: Answered,
     /// Matched views where they answer, elsewhere the most similar frame.
     pub ours_or_nearest: LocalizationErrors,
@@ -170,7 +170,8 @@ struct Located {
 }
 
 /// Maps the mapped frames of a recording and locates the asked ones, on the threads of the calling
-/// rayon pool. The baselines retrieve frames by `features`, shape (n, d). `clock` gives seconds; `done` is called after each view.
+/// rayon pool. The baselines retrieve frames by `features`, shape (n, d). `clock` gives seconds;
+/// `done` is called after each view.
 ///
 /// # Errors
 /// [`Error::Input`] if no frame is mapped or asked for, if no mapped frame has a keypoint, or if a

@@ -1,5 +1,6 @@
 //! What happens to robots: parts without a map or without images, kidnaps, wheels and inertial
-//! sensors. Each scenario replays tracked frames of a room, beside simple baselines on the same frames.
+//! sensors. Each scenario replays tracked frames of a room, beside simple baselines on the same
+//! frames.
 
 use serde::Serialize;
 
@@ -98,7 +99,7 @@ pub struct Kidnaps {
     /// Distances, meters.
     #[serde(rename = "distance_m", serialize_with = "as_median")]
     pub distances_m: Vec<f64>,
-    /// Number of TRACKING frames after the kidnaps, and of wrong poses among them.
+    /// Number of TRACKING frames after the kidnaps.
     pub tracking: usize,
     /// Wrong poses among the TRACKING frames.
     pub wrong: usize,
@@ -141,11 +142,13 @@ impl Scenarios {
         });
         let mut kidnaps = Kidnaps::default();
         let depths = simulated_depths(streams, &player(None));
+
         for (views, depths) in streams.iter().zip(&depths) {
             add_dark(&mut dark, views, player);
             add_gaps(&mut gaps, views, player, depths);
             kidnaps.add(views, &|| player(None));
         }
+
         Self {
             gaps: gaps.to_vec(),
             kidnaps,
@@ -199,9 +202,11 @@ impl Scenarios {
             }
         };
         together.mapless = MaplessDrift::mean(rooms.clone().map(|room| &room.mapless));
+
         let wheels: Vec<SensorErrors> = rooms.clone().map(|room| room.wheels).collect();
         let inertial: Vec<SensorErrors> = rooms.clone().map(|room| room.inertial).collect();
         let depths: Option<Vec<SensorErrors>> = rooms.map(|room| room.depths).collect();
+
         together.wheels = mean(&wheels);
         together.inertial = mean(&inertial);
         together.depths = depths.map(|depths| mean(&depths));
@@ -265,13 +270,14 @@ fn part_ends<'a, 'v>(
     let mut next_s = GAP_EVERY_S;
     for (row, view) in views.iter().enumerate() {
         let update = player.step(view, Sight::Mapped, &sensed[row]);
-        let is_due = seconds_between(&views[0], view) >= next_s;
+        let seconds = seconds_between(&views[0], view);
+        let is_due = seconds >= next_s;
         let pose = update.and_then(|update| update.map_pose);
         let Some(start) = pose.filter(|_| is_due) else {
             continue;
         };
 
-        next_s += GAP_EVERY_S;
+        next_s = (seconds / GAP_EVERY_S).floor() * GAP_EVERY_S + GAP_EVERY_S;
         let mut branch = player.clone();
         let mut lengths = GAPS_S.into_iter().enumerate().peekable();
         for (later, sensed) in views.iter().zip(sensed).skip(row + 1) {
@@ -295,8 +301,8 @@ fn part_ends<'a, 'v>(
     found
 }
 
-/// Adds the errors at the ends of parts in which no view is matched with the map: by images alone, and with
-/// `depths` if there are any.
+/// Adds the errors at the ends of parts in which no view is matched with the map: by images alone,
+/// and with `depths` if there are any.
 fn add_gaps<'a>(
     gaps: &mut [GapErrors],
     views: &[PlayedView<'a>],
@@ -367,6 +373,7 @@ impl Kidnaps {
             let before = &views[from..from + KIDNAP_FRAMES];
             let after = &views[to..to + KIDNAP_FRAMES];
             let last = &before[KIDNAP_FRAMES - 1];
+
             let distance = PoseError::between(&last.truth, &after[0].truth).translation_m;
             if distance < LEAST_KIDNAP_M {
                 continue;
@@ -376,11 +383,14 @@ impl Kidnaps {
             for view in before {
                 player.step(view, Sight::Mapped, &Sensed::default());
             }
+
             self.n += 1;
             self.distances_m.push(distance);
+
             let period_ns = (last.time_ns - before[0].time_ns) / (KIDNAP_FRAMES as i64 - 1);
             let shift_ns = last.time_ns + period_ns - after[0].time_ns;
             let mut recovered_after = None;
+
             for (place, view) in after.iter().enumerate() {
                 let view = PlayedView {
                     time_ns: view.time_ns + shift_ns,
@@ -390,6 +400,7 @@ impl Kidnaps {
                 let Some(update) = player.step(&view, Sight::Mapped, &Sensed::default()) else {
                     continue;
                 };
+
                 let tracked = update
                     .map_pose
                     .filter(|_| update.status == Status::Tracking);
@@ -402,6 +413,7 @@ impl Kidnaps {
                     }
                 }
             }
+
             let recovered = recovered_after.map(|frames| frames as f64);
             self.recovered_after.extend(recovered);
         }
@@ -433,10 +445,12 @@ fn with_sensors<'a>(
                     .measured
                     .map(|measured| error_m(&(first * measured.pose))),
             );
+
             let update = player.step(view, Sight::Mapped, sensed);
             let Some(update) = update else { continue };
             tracking += usize::from(update.status == Status::Tracking);
             fused.extend(update.map_pose.map(|pose| error_m(&pose.pose)));
+
             if let (Some(before), Some(reported)) = (before, update.velocity) {
                 let seconds = (view.time_ns - before.time_ns) as f64 * 1e-9;
                 let motion = body_twist(&before.truth, &view.truth);
@@ -444,6 +458,7 @@ fn with_sensors<'a>(
             }
         }
     }
+
     SensorErrors {
         fused: root_mean_square(&fused),
         alone: (!alone.is_empty()).then(|| root_mean_square(&alone)),

@@ -14,8 +14,8 @@ use seese3_robot::pose_filter::MeasuredInertia;
 use seese3_robot::tracking::{Drift, MeasuredPose};
 use seese3_robot::visual_odometry::KnownDepth;
 
-/// Simulated wheels: relative error of lengths, rotation per meter, and noise of each step along each
-/// axis, meters.
+/// Simulated wheels: relative error of lengths, rotation per meter, and noise of each step along
+/// each axis, meters.
 const WHEEL_LENGTH_ERROR: f64 = 0.02;
 const WHEEL_TURN_RAD: f64 = 0.017_453;
 const WHEEL_NOISE_M: f64 = 5e-4;
@@ -26,20 +26,21 @@ const WHEEL_DRIFT: Drift = Drift {
 };
 
 /// Simulated inertial sensor: time between samples, seconds; white noise of gyroscope and
-/// accelerometer, rad/s/√Hz and m/s²/√Hz; standard deviations of their biases, rad/s and m/s². It states
-/// [`InertialNoise::TYPICAL`].
+/// accelerometer, rad/s/√Hz and m/s²/√Hz; standard deviations of their biases, rad/s and m/s². It
+/// states [`InertialNoise::TYPICAL`].
 const SAMPLE_S: f64 = 5e-3;
 const DENSITIES: [f64; 2] = [2e-4, 3e-3];
 const BIASES: [f64; 2] = [5e-3, 5e-2];
-/// Simulated depth camera: standard deviation of a depth of 1 m, meters, growing with the square of the
-/// depth; and the largest relative deviation of a triangulated depth that stands for a true one.
+/// Simulated depth camera: standard deviation of a depth of 1 m, meters, growing with the square of
+/// the depth; and the largest relative deviation of a triangulated depth that stands for a true
+/// one.
 const DEPTH_DEVIATION: f64 = 0.005;
 const MAX_TRIANGULATION_DEVIATION: f64 = 0.1;
 /// Half of the time over which the angular rate is computed, seconds.
 const RATE_S: f64 = 5e-4;
 
-/// What wheels say at each view: a wrong length, a rotation per meter about the image's vertical axis,
-/// and noise.
+/// What wheels say at each view: a wrong length, a rotation per meter about the image's vertical
+/// axis, and noise.
 pub(super) fn wheels(views: &[PlayedView<'_>], seed: u64) -> Vec<Sensed> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut sign = || if rng.random_bool(0.5) { 1.0 } else { -1.0 };
@@ -92,8 +93,8 @@ pub(super) fn inertial(views: &[PlayedView<'_>], seed: u64) -> Vec<Sensed> {
     sensed.collect()
 }
 
-/// What a depth camera says at each view: depths of keypoints that are triangulated with the true poses,
-/// with noise. Empty if the views have no keypoints or are too few.
+/// What a depth camera says at each view: depths of keypoints that are triangulated with the true
+/// poses, with noise. Empty if the views have no keypoints or are too few.
 pub(super) fn depths(
     views: &[PlayedView<'_>],
     camera: &CameraIntrinsics,

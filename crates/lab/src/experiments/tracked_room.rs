@@ -53,8 +53,8 @@ pub struct TrackingProtocol {
     pub hold_out: HoldOut,
     /// Parameters of the filter.
     pub parameters: FilterParameters,
-    /// Whether an adapter is fitted to the mapped frames, starting from the given adapter's weights.
-    /// The fitted adapter then locates the views. For tracking by an adapter alone.
+    /// Whether an adapter is fitted to the mapped frames, starting from the given adapter's
+    /// weights. The fitted adapter then locates the views. For tracking by an adapter alone.
     pub is_fitted: bool,
 }
 
@@ -339,8 +339,8 @@ impl<'a> TrackedRoom<'a> {
         replay
     }
 
-    /// A player of a new stream, which starts at a known pose, `world_from_camera`, if there is one.
-    /// A camera that the `example` view does not state is estimated.
+    /// A player of a new stream, which starts at a known pose, `world_from_camera`, if there is
+    /// one. A camera that the `example` view does not state is estimated.
     pub(super) fn player(
         &self,
         first: Option<Pose>,
@@ -374,8 +374,8 @@ impl<'a> TrackedRoom<'a> {
     }
 
     /// Tracks disturbed streams, each from its true first pose. The camera is that of the map,
-    /// stated, except for a narrower field of view: then it is unknown, and estimated from the first
-    /// views.
+    /// stated, except for a narrower field of view: then it is unknown, and estimated from the
+    /// first views.
     ///
     /// # Errors
     /// [`Error::Adapter`] if the features are not those of the adapter.

@@ -46,16 +46,16 @@ pub struct TrackingIntervals {
     pub tracking: [f64; 2],
     /// Share of wrong poses among TRACKING frames.
     pub tracking_wrong: [f64; 2],
-    /// Shares of TRACKING poses in the 68 % and 95 % ellipsoids.
+    /// Share of TRACKING poses in the 68 % ellipsoid.
     pub coverage_68: [f64; 2],
-    /// See [`TrackingIntervals::coverage_68`].
+    /// The same for the 95 % ellipsoid.
     pub coverage_95: [f64; 2],
     /// Root-mean-square error of the velocity, relative to that of reporting zero.
     pub velocity_ratio: [f64; 2],
 }
 
-/// The blocks of a replay, in order. `nearest_frame` returns the pose of the mapped frame with the raw
-/// feature most similar to that of a row.
+/// The blocks of a replay, in order. `nearest_frame` returns the pose of the mapped frame with the
+/// raw feature most similar to that of a row.
 pub fn blocks_of(replay: &Replay, nearest_frame: impl Fn(usize) -> Pose) -> Vec<BlockSums> {
     let truth = &replay.truth;
     let frame = |row: usize| {
@@ -63,7 +63,9 @@ pub fn blocks_of(replay: &Replay, nearest_frame: impl Fn(usize) -> Pose) -> Vec<
             frames: 1.0,
             ..BlockSums::default()
         };
+
         let (update, pose) = (&replay.updates[row], &truth.poses[row]);
+
         let squared_m = |given: &Pose| PoseError::between(given, pose).translation_m.powi(2);
         if let Some(map_pose) = &update.map_pose {
             sums.placed = 1.0;
@@ -77,12 +79,14 @@ pub fn blocks_of(replay: &Replay, nearest_frame: impl Fn(usize) -> Pose) -> Vec<
                 sums.within = [within.within_68, within.within_95];
             }
         }
+
         if let (Some(velocity), Some(last)) = (update.velocity, row.checked_sub(1)) {
             let seconds = (truth.times_ns[row] - truth.times_ns[last]) as f64 * 1e-9;
             let true_velocity = body_twist(&truth.poses[last], pose).linear / seconds;
             sums.velocity = (velocity.linear - true_velocity).norm_squared();
             sums.speed = true_velocity.norm_squared();
         }
+
         sums
     };
 
@@ -118,6 +122,7 @@ fn scores(rooms: &[BlockSums]) -> [f64; 8] {
     };
     let fused_m = mean_error(|room| room.fused_m2);
     let nearest_m = mean_error(|room| room.nearest_m2);
+
     let all = BlockSums::total(rooms);
     let velocities = rooms
         .iter()
@@ -138,8 +143,9 @@ fn scores(rooms: &[BlockSums]) -> [f64; 8] {
 }
 
 impl TrackingIntervals {
-    /// Percentile intervals over samples: rooms are drawn with replacement, then blocks within each of
-    /// them. One room is always drawn: its interval is that of its recording. `None` without a frame.
+    /// Percentile intervals over samples: rooms are drawn with replacement, then blocks within each
+    /// of them. One room is always drawn: its interval is that of its recording. `None` without a
+    /// frame.
     pub fn of(rooms: &[&[BlockSums]]) -> Option<Self> {
         let rooms: Vec<&[BlockSums]> = rooms.iter().copied().filter(|r| !r.is_empty()).collect();
         if rooms.is_empty() {
@@ -205,10 +211,10 @@ mod tests {
         }
     }
 
-    /// Oracle: by hand. Equal blocks have intervals of width zero. Of two rooms that differ, a sample holds
-    /// either one twice with probability 1/4, so the interval reaches from one to the other. Of one room
-    /// with as many blocks that are TRACKING as not, the share in 20 draws is binomial: 95 % of
-    /// B(20, 1/2) lie in 6 to 14.
+    /// Oracle: by hand. Equal blocks have intervals of width zero. Of two rooms that differ, a
+    /// sample holds either one twice with probability 1/4, so the interval reaches from one to the
+    /// other. Of one room with as many blocks that are TRACKING as not, the share in 20 draws is
+    /// binomial: 95 % of B(20, 1/2) lie in 6 to 14.
     #[test]
     fn rooms_and_blocks_are_resampled() {
         let near = vec![block(0.1, true); 20];

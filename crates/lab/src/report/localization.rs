@@ -29,8 +29,8 @@ pub fn localization_table(found: &Localization) -> Table {
     )
 }
 
-/// One line per method and part of the views: share answered, medians with intervals, 90 % quantiles,
-/// wrong answers and coverage.
+/// One line per method and part of the views: share answered, medians with intervals, 90 %
+/// quantiles, wrong answers and coverage.
 pub fn matched_localization_table(found: &MatchedLocalization) -> String {
     let mut table = Table::new(
         "views | located by | answered | median m | 90 % m | median ° | 90 % ° | wrong | 68 % | 95 %",

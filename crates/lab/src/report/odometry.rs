@@ -190,8 +190,8 @@ fn scenarios(rooms: &[RoomOdometry]) -> Option<Scenarios> {
     Scenarios::together(rooms.iter().map(|room| &room.scenarios))
 }
 
-/// Position errors of parts without a map, kidnaps and wheels, over all rooms; `None` for streams of
-/// an adapter.
+/// Position errors of parts without a map, kidnaps and wheels, over all rooms; `None` for streams
+/// of an adapter.
 pub fn scenarios_text(rooms: &[RoomOdometry]) -> Option<String> {
     let Scenarios {
         gaps,

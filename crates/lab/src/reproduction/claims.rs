@@ -73,7 +73,8 @@ impl Verdict {
     }
 
     /// The verdict over cases decided by confidence intervals. `None` is undecided: its interval
-    /// contains the limit, or there are too few rooms. A claim is confirmed or contradicted only if all intervals agree.
+    /// contains the limit, or there are too few rooms. A claim is confirmed or contradicted only if
+    /// all intervals agree.
     pub fn of_intervals(cases: &[Option<bool>]) -> Self {
         match Self::of_telling(cases) {
             Self::Confirmed | Self::Contradicted if cases.contains(&None) => Self::Mixed,

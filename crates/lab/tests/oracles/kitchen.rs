@@ -239,7 +239,8 @@ fn the_pose_files_give_the_poses_of_the_array() {
     }
 }
 
-/// Oracle: the convention in which the published poses were written down again, each of the usual ones.
+/// Oracle: the convention in which the published poses were written down again, each of the usual
+/// ones.
 #[test]
 #[ignore = "needs the folder of large inputs: SEESE3_SHARED or ../shared"]
 fn photographs_name_the_convention_of_poses() {

@@ -122,9 +122,9 @@ fn exact_views_are_all_answered_right() {
     );
 }
 
-/// Oracle: by hand. The peer is asked for six views and answers five, one of them 0.3 m off, which is
-/// wrong. We answer five of the six as well: not view 6, and view 8 1 m off. On the four views that
-/// both answer, our errors are 0, 0, 0 and 1 m, and the peer's 0.1, 0.05, 0.3 and 0 m.
+/// Oracle: by hand. The peer is asked for six views and answers five, one of them 0.3 m off, which
+/// is wrong. We answer five of the six as well: not view 6, and view 8 1 m off. On the four views
+/// that both answer, our errors are 0, 0, 0 and 1 m, and the peer's 0.1, 0.05, 0.3 and 0 m.
 #[test]
 fn a_peer_is_compared_on_the_views_that_it_is_asked_for() {
     let (poses, _) = recording();

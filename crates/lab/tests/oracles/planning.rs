@@ -7,6 +7,7 @@ use seese3_core::adapter::Adapter;
 use seese3_core::features::Features;
 use seese3_core::room::Room;
 use seese3_core::splits::HoldOut;
+use seese3_core::statistics::coverage;
 use seese3_core::training::RoomData;
 use seese3_lab::experiments::odometry;
 use seese3_lab::experiments::planning::{self, Planner, PlannerScores, PlanningProtocol};
@@ -24,10 +25,10 @@ fn data<'a>(room: &'a Room, features: &'a Features) -> RoomData<'a> {
     }
 }
 
-/// Oracle: the definitions of the simple planners. A pose graph takes any view for its room; a robot
-/// that stands still says that it is there and mostly is not. Ours refuses some views of other rooms,
-/// and no planner is there more often, the pose graph included, which is there more often than a robot
-/// that stands still.
+/// Oracle: the definitions of the simple planners. A pose graph takes any view for its room; a
+/// robot that stands still says that it is there and mostly is not. Ours refuses some views of
+/// other rooms, and no planner is there more often, the pose graph included, which is there more
+/// often than a robot that stands still.
 #[test]
 fn planners_say_what_they_know() {
     let adapter = Arc::new(calibrated().0);
@@ -106,8 +107,39 @@ fn an_undisturbed_camera_is_tracked_as_ever() {
     assert_eq!(plain.noticed_after, None);
 }
 
-/// Oracle: the rules: a blank image is noticed at once, a frozen camera at the sixth image that is the
-/// same or before. A camera that takes every fourth frame answers a fourth of them.
+/// Oracle: the scores of the same replay, which other code computes.
+#[test]
+fn intervals_contain_the_scores() {
+    let adapter = Arc::new(calibrated().0);
+    let hall = served("hall");
+    let found = odometry::evaluate(&tracked(&hall, &adapter), &|_, _| ()).unwrap();
+    let found = &found[0];
+    let intervals = found.intervals_95.unwrap();
+
+    let (scores, velocity) = (&found.scores, found.scores.velocity);
+    let covered = coverage(&scores.tracking_surprises);
+    let pairs = [
+        (scores.ape.fused, intervals.fused_m),
+        (scores.ape.nearest_frame, intervals.nearest_frame_m),
+        (found.statuses.tracking, intervals.tracking),
+        (f64::from(scores.tracking_wrong), intervals.tracking_wrong),
+        (covered.within_68, intervals.coverage_68),
+        (covered.within_95, intervals.coverage_95),
+        (
+            velocity.error_m_s / velocity.zero_m_s,
+            intervals.velocity_ratio,
+        ),
+    ];
+    for (number, (score, [least, most])) in pairs.into_iter().enumerate() {
+        assert!(
+            least <= score && score <= most,
+            "{number}: {score}, {least} to {most}"
+        );
+    }
+}
+
+/// Oracle: the rules: a blank image is noticed at once, a frozen camera at the sixth image that is
+/// the same or before. A camera that takes every fourth frame answers a fourth of them.
 #[test]
 fn a_disturbance_is_scored_while_it_is_there() {
     let adapter = Arc::new(calibrated().0);

@@ -63,7 +63,8 @@ pub enum Error {
 pub struct Calibrated {
     /// The adapter with its measured errors.
     pub adapter: Adapter,
-    /// The training record; `calibrated_on` names the calibration rooms, which leak detection reads.
+    /// The training record; `calibrated_on` names the calibration rooms, which leak detection
+    /// reads.
     pub record: TrainingRecord,
     /// Whether the adapter can track cameras now; one room is too few.
     pub can_track: bool,
@@ -73,8 +74,8 @@ pub struct Calibrated {
 /// record of its training.
 ///
 /// # Errors
-/// [`Error`], when the adapter was trained on one of the rooms, a room is too short, or its features
-/// are not the adapter's.
+/// [`Error`], when the adapter was trained on one of the rooms, a room is too short, or its
+/// features are not the adapter's.
 pub fn calibrate(
     adapter: Adapter,
     record: TrainingRecord,

@@ -7,8 +7,8 @@
 //! estimator; far from it, the pose of the nearest mapped frame can be better. The fit is therefore
 //! cross-validated: four more models, each trained without a part of the mapped frames, localize
 //! that part. [`ReadingRules`] hold the result for each range of distances from the map: an
-//! estimator and its gain (a factor from 0 to 1) for the translation, the same for the rotation, and
-//! a covariance. A [`Localizer`] applies these rules.
+//! estimator and its gain (a factor from 0 to 1) for the translation, the same for the rotation,
+//! and a covariance. A [`Localizer`] applies these rules.
 //!
 //! Distances are between features, z-scored over the mapped frames, so that all estimators start
 //! from the same mapped frame.

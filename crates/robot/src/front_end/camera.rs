@@ -55,8 +55,8 @@ pub(super) struct CameraVotes {
 }
 
 impl CameraVotes {
-    /// Counts a match, and withdraws its pose if most views contradict the camera: views far from the
-    /// map do not determine their focal length, and would be located at a wrong place.
+    /// Counts a match, and withdraws its pose if most views contradict the camera: views far from
+    /// the map do not determine their focal length, and would be located at a wrong place.
     pub fn judged(&mut self, found: FoundView) -> FoundView {
         self.located += u32::from(found.located.is_some());
         if let Some(why) = found.why_not.filter(NotLocated::is_of_camera) {

@@ -5,8 +5,8 @@
 //!
 //! 1. The camera is stated, that of the map, or estimated from the first views.
 //! 2. A view is located in the stream's room or, while that is unknown, in all rooms.
-//! 3. Visual odometry measures the motion since the last view. A located view gives it the depths of
-//!    its keypoints; for other views a sensor may.
+//! 3. Visual odometry measures the motion since the last view. A located view gives it the depths
+//!    of its keypoints; for other views a sensor may.
 
 mod camera;
 mod retrieval;
@@ -57,7 +57,7 @@ pub struct StreamImage<'a> {
     pub predicted: Option<Pose>,
     /// The motion since the last frame, if another sensor measures it.
     pub predicted_motion: Option<Pose>,
-    /// Depths of keypoints that a sensor measures. Not used if the view is located: the map then has them.
+    /// Depths of keypoints that a sensor measures. The map has those of a located view.
     pub depths: &'a [KnownDepth],
 }
 
@@ -200,8 +200,8 @@ impl FrontEnd {
         }
     }
 
-    /// Sets the motion to the last frame to the filter's estimate if visual odometry found none. A later image
-    /// corrects it.
+    /// Sets the motion to the last frame to the filter's estimate if visual odometry found none. A
+    /// later image corrects it.
     pub fn assume(&mut self, motion: &Pose) {
         if let Some(odometry) = &mut self.odometry {
             odometry.assume(motion);

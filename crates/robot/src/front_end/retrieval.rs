@@ -14,7 +14,7 @@ use seese3_core::geometry::Pose;
 
 /// Largest novelty of a view that shows the room for certain. Other views only correct a pose that
 /// agrees with them. Chosen on eight drawn rooms. With a limit of 1, 54 % of the TRACKING poses of
-/// another visit were wrong; with 0.5, 8 %. On mapped paths the TRACKING frames fell from 100 to 95 %.
+/// another visit were wrong; with 0.5, 8 %. On mapped paths, TRACKING fell from 100 % to 95 %.
 const CERTAIN_NOVELTY: f64 = 0.5;
 
 /// A view of one of the robot's cameras.
@@ -37,12 +37,12 @@ pub struct OtherCamera {
     pub number: u32,
     /// Its pose when its view was taken, in the stream's own camera at the time of the frame.
     pub camera_from_other: Pose,
-    /// Covariance of the motion between these two times, of δ on the right of the pose of the stream's own
-    /// camera, ordered (v, ω).
+    /// Covariance of the motion between these two times, of δ on the right of the pose of the
+    /// stream's own camera, ordered (v, ω).
     pub motion_covariance: Matrix6<f64>,
 }
 
-/// The front end of a stream of latents and features. It is kept in memory while the stream is open.
+/// The front end of a stream of latents and features, kept in memory while the stream is open.
 #[derive(Debug, Clone, Default)]
 pub struct RetrievalFrontEnd {
     /// The last view of each camera that was not blank, by the camera's number: its fingerprint.
@@ -56,8 +56,7 @@ pub struct RetrievalReading {
     pub located: Vec<LocatedPose>,
     /// The most similar mapped frame.
     pub best_match: Option<BestMatch>,
-    /// How unlike the most similar view is to the map, relative to the limit; infinite if all are
-    /// blank.
+    /// Least novelty of the views, relative to the limit; infinite if all are blank.
     pub novelty: f64,
     /// Why no view certainly shows a room; empty if one does.
     pub unlocated: String,
@@ -179,8 +178,8 @@ impl Retrieved<'_> {
         self.is_new && self.is_clear && self.matched.out_of_distribution <= CERTAIN_NOVELTY
     }
 
-    /// The pose of the stream's own camera. A localizer of the room estimates that of a certain match;
-    /// outside the mapped part it is overconfident.
+    /// The pose of the stream's own camera. A localizer of the room estimates that of a certain
+    /// match; outside the mapped part it is overconfident.
     fn located(&self, maps: &[Arc<Map>]) -> LocatedPose {
         let feature = self.view.feature.filter(|_| self.matched.is_certain);
         let by_reader = maps[self.room].pose_by_reader(feature);

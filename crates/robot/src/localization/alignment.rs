@@ -24,8 +24,8 @@ const ROUNDS: usize = 5;
 pub struct MapAlignment {
     /// The frame of the map, from that of the other room. Its scale is 1 unless it was estimated.
     pub map_from_other: Similarity,
-    /// Number of frames of the other room that were looked for, that were located in the map, and that
-    /// agree with the alignment.
+    /// Number of frames of the other room that were looked for, that were located in the map, and
+    /// that agree with the alignment.
     pub counts: [usize; 3],
     /// Root mean squares of their differences from the alignment, meters and radians.
     pub residuals: [f64; 2],
@@ -150,8 +150,8 @@ fn fitted(pairs: &[Pair], with_scale: bool, limit_m: f64) -> Option<(Similarity,
     Some((similarity(&kept, with_scale)?, kept))
 }
 
-/// The mean rotation, then the least-squares scale and translation of the positions; `None` without a
-/// pair.
+/// The mean rotation, then the least-squares scale and translation of the positions; `None` without
+/// a pair.
 fn similarity(pairs: &[Pair], with_scale: bool) -> Option<Similarity> {
     let count = pairs.len() as f64;
     let mut moment = Matrix4::zeros();

@@ -11,8 +11,8 @@ use seese3_core::statistics::median;
 /// Focal lengths that are tried, image widths. Between two of them the fit converges.
 const CANDIDATES: [f64; 6] = [0.55, 0.68, 0.84, 1.04, 1.28, 1.58];
 
-/// Number of first views that are tried for an unknown focal length, and the period of later tries in
-/// views. A try takes some 100 ms for each room.
+/// Number of first views that are tried for an unknown focal length, and the period of later tries
+/// in views. A try takes some 100 ms for each room.
 const FIRST_TRIES: u32 = 5;
 /// Number of views with a focal length after which the camera is known.
 const MIN_FOCALS: usize = 3;
@@ -82,8 +82,8 @@ impl FocalSearch {
         located
     }
 
-    /// Notes a view whose matches contradict the estimated focal length. After several in succession
-    /// the search begins again.
+    /// Notes a view whose matches contradict the estimated focal length. After several in
+    /// succession the search begins again.
     pub fn contradict(&mut self) {
         self.contradictions += 1;
         if self.contradictions >= MAX_CONTRADICTIONS {
@@ -107,11 +107,11 @@ fn simple_camera(focal: f64, height: f64) -> Result<CameraIntrinsics, CameraErro
     })
 }
 
-/// The focal length of a view whose camera is unknown, image widths, and the number of keypoints that
-/// agree with it. `height` is that of the image, image widths.
+/// The focal length of a view whose camera is unknown, image widths, and the number of keypoints
+/// that agree with it. `height` is that of the image, image widths.
 ///
-/// The view is matched at each of six focal lengths. The one with the most inliers is refined by its
-/// matches. `None` if too few keypoints agree with any.
+/// The view is matched at each of six focal lengths. The one with the most inliers is refined by
+/// its matches. `None` if too few keypoints agree with any.
 fn focal_of_view(room: &KeypointRoom, keypoints: &Keypoints, height: f64) -> Option<(f64, usize)> {
     let fits = CANDIDATES.into_iter().filter_map(|focal| {
         let camera = simple_camera(focal, height).ok()?;

@@ -37,8 +37,8 @@ pub struct LocatedView {
     pub inliers: usize,
     /// Number of the view's keypoints.
     pub keypoints: usize,
-    /// The worst of the acceptance gates: how close the view is to the limit, at most 1. A view with
-    /// the fewest accepted inliers has 1, one with twice as many 0.5.
+    /// The worst of the acceptance gates: how close the view is to the limit, at most 1. A view
+    /// with the fewest accepted inliers has 1, one with twice as many 0.5.
     pub novelty: f64,
     /// The matches.
     pub matched: MatchedView,
@@ -182,7 +182,8 @@ impl KeypointRoom {
         near.map_or_else(|| self.locate(view), Ok)
     }
 
-    /// The depths of the keypoints of a located view, from the map points that they are matched with.
+    /// The depths of the keypoints of a located view, from the map points that they are matched
+    /// with.
     pub fn known_depths(&self, view: &LocatedView) -> Vec<KnownDepth> {
         let matches = view.matched.matches.iter();
         let depth = |found: &InlierMatch| {

@@ -70,8 +70,8 @@ impl PoseEstimate {
     /// - `matched` is the result of the keypoints, `None` if they were not tried.
     /// - `similar` gives the estimate from the most similar frames, `None` without an adapter.
     ///
-    /// Similar frames give a pose if their novelty is at most 1. If it is unknown, they give one only
-    /// if no keypoints were tried.
+    /// Similar frames give a pose if their novelty is at most 1. If it is unknown, they give one
+    /// only if no keypoints were tried.
     ///
     /// # Errors
     /// [`NotInRoom`] if neither gives a pose, or if the matches contradict the view's camera.

@@ -52,9 +52,9 @@ pub(crate) struct Correspondence {
 ///
 /// H is the information matrix of the matches for independent errors, at the measured variance of
 /// their reprojection errors. The errors are correlated: nearby points share depth errors, whose
-/// effect on the pose grows with the gap. Stated poses have independent noise. Errors of the camera's
-/// focal length and lens, and of the scale of depths, move the pose by a share of the gap. I is the
-/// identity in units (median depths) and radians.
+/// effect on the pose grows with the gap. Stated poses have independent noise. Errors of the
+/// camera's focal length and lens, and of the scale of depths, move the pose by a share of the gap.
+/// I is the identity in units (median depths) and radians.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct MapNoise {
@@ -108,8 +108,8 @@ pub(crate) struct Search {
     pub seed: u64,
 }
 
-/// Coordinates of correspondences, in blocks. The last block is filled with NaN, which costs as much
-/// as an outlier.
+/// Coordinates of correspondences, in blocks. The last block is filled with NaN, which costs as
+/// much as an outlier.
 struct Columns {
     /// x, y and z of the map points.
     world: Vec<[[f64; BLOCK]; 3]>,
@@ -523,8 +523,8 @@ mod tests {
         }
     }
 
-    /// Oracle: PoseLib on the same correspondences (`tests/golden/absolute_pose`). With noise, the two
-    /// losses differ, and the poses agree within a standard deviation.
+    /// Oracle: PoseLib on the same correspondences (`tests/golden/absolute_pose`). With noise, the
+    /// two losses differ, and the poses agree within a standard deviation.
     #[test]
     fn the_pose_is_that_of_poselib() {
         let file = json(&golden().join("absolute_pose/expected.json"));

@@ -98,8 +98,8 @@ impl DescriptorBasis {
         packed(&(full - &self.mean).dot(&self.axes))
     }
 
-    /// Descriptors that another basis compressed, compressed by this one. Neglects the difference of
-    /// the means: both bases are of one encoder.
+    /// Descriptors that another basis compressed, compressed by this one. Neglects the difference
+    /// of the means: both bases are of one encoder.
     ///
     /// # Panics
     /// If the bases have different widths.
@@ -143,7 +143,8 @@ pub(super) fn mutual_matches(
     min_cosine: f32,
 ) -> Vec<(usize, usize)> {
     let similarity = a.dot(&b.t());
-    // For each row of `b`, its most similar row of `a`. Without branches, the compiler vectorizes this.
+    // For each row of `b`, its most similar row of `a`. Without branches, the compiler vectorizes
+    // this.
     let mut cosines = vec![f32::NEG_INFINITY; b.nrows()];
     let mut best_in_a = vec![0_u32; b.nrows()];
     for (row, similar) in similarity.outer_iter().enumerate() {
@@ -166,9 +167,9 @@ pub(super) fn mutual_matches(
         .collect()
 }
 
-/// Pairs of keypoints of two views, by their places, that are each other's most similar one and whose
-/// cosine is at least `min_cosine`, among the first `candidates` of each; empty if the descriptors
-/// have different widths.
+/// Pairs of keypoints of two views, by their places, that are each other's most similar one and
+/// whose cosine is at least `min_cosine`, among the first `candidates` of each; empty if the
+/// descriptors have different widths.
 pub(crate) fn matched_keypoints(
     first: &Keypoints,
     second: &Keypoints,

@@ -1,7 +1,7 @@
 //! The focal length of a view that fits its matches best.
 //!
-//! Pose and focal length are refined together. Matches that a wrong focal length excludes join step by
-//! step, because the thresholds begin wide.
+//! Pose and focal length are refined together. Matches that a wrong focal length excludes join step
+//! by step, because the thresholds begin wide.
 
 use std::collections::BTreeSet;
 
@@ -14,8 +14,8 @@ use seese3_core::geometry::{Pose, Twist, exp};
 const THRESHOLDS: [f64; 10] = [4.0, 4.0, 3.0, 3.0, 2.0, 2.0, 1.5, 1.0, 1.0, 1.0];
 /// Largest change of the logarithm of the focal length in one step.
 const MAX_STEP: f64 = 0.1;
-/// Largest logarithm of a fitted focal length over the stated one. Beyond it, the fit has shrunk the
-/// view to a point.
+/// Largest logarithm of a fitted focal length over the stated one. Beyond it, the fit has shrunk
+/// the view to a point.
 const MAX_LOG_FACTOR: f64 = 0.6;
 
 /// A fitted focal length.

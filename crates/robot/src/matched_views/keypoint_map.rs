@@ -89,8 +89,8 @@ pub struct KeypointMap {
     pub camera: CameraIntrinsics,
     /// Median depth of the keypoints, meters.
     pub unit_m: f64,
-    /// Median distance of matched keypoints from their epipolar lines, pixels; measures the noise of
-    /// the map's poses and of its camera.
+    /// Median distance of matched keypoints from their epipolar lines, pixels; measures the noise
+    /// of the map's poses and of its camera.
     pub epipolar_px: f64,
     /// Noise, from which covariances follow.
     pub noise: MapNoise,
@@ -200,7 +200,8 @@ impl<'a> Mapping<'a> {
         mapped
     }
 
-    /// Maps all frames, on the threads of the calling rayon pool. `done` is called after each frame.
+    /// Maps all frames, on the threads of the calling rayon pool. `done` is called after each
+    /// frame.
     pub fn map(&self, done: &(dyn Fn() + Sync)) -> KeypointMap {
         let frames = (0..self.frames.len())
             .into_par_iter()
@@ -263,8 +264,8 @@ impl<'a> Mapping<'a> {
         }
     }
 
-    /// Frames near the one in `row` that see the same scene from another place, the best first, among
-    /// those that `is_used` keeps.
+    /// Frames near the one in `row` that see the same scene from another place, the best first,
+    /// among those that `is_used` keeps.
     fn neighbors(&self, row: usize, is_used: &dyn Fn(usize) -> bool) -> Vec<usize> {
         let MappingParameters {
             neighbors,
@@ -331,11 +332,12 @@ fn first_unit(poses: &[Pose]) -> f64 {
     }
 }
 
-/// The unit in which the median distance of a camera to the nearest other one is the ideal baseline,
-/// meters; `None` if all cameras are in one place.
+/// The unit in which the median distance of a camera to the nearest other one is the ideal
+/// baseline, meters; `None` if all cameras are in one place.
 ///
-/// A few frames are farther apart than the largest baseline in their first unit: two frames that are b
-/// apart have a first unit of 0.75 b. In this unit they are neighbors if their depth allows it.
+/// A few frames are farther apart than the largest baseline in their first unit: two frames that
+/// are b apart have a first unit of 0.75 b. In this unit they are neighbors if their depth allows
+/// it.
 fn nearest_unit(poses: &[Pose], parameters: &MappingParameters) -> Option<f64> {
     let nearest: Vec<f64> = poses
         .iter()

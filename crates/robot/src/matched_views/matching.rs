@@ -106,7 +106,8 @@ impl KeypointMap {
         self.match_query(&query, candidates, poses, parameters)
     }
 
-    /// Matches a frame of another map of the same encoder, by its row, with the most similar frames.
+    /// Matches a frame of another map of the same encoder, by its row, with the most similar
+    /// frames.
     pub fn match_mapped(
         &self,
         (other, row): (&Self, usize),

@@ -1,5 +1,5 @@
-//! Measures the noise of a map. Trials locate mapped frames as if a part of the map around them were
-//! missing; the noise under which their errors are most probable is found.
+//! Measures the noise of a map. Trials locate mapped frames as if a part of the map around them
+//! were missing; the noise under which their errors are most probable is found.
 
 use nalgebra::{Cholesky, Matrix6, Vector4, Vector6};
 use rayon::prelude::*;
@@ -44,8 +44,8 @@ pub struct Trial {
     pub information: PoseInformation,
 }
 
-/// The frames that are missing in a trial: the view's own frame, those within a radius of it and, in
-/// some trials, the later or the earlier ones too, as for a robot that leaves the map.
+/// The frames that are missing in a trial: the view's own frame, those within a radius of it and,
+/// in some trials, the later or the earlier ones too, as for a robot that leaves the map.
 #[derive(Debug, Clone, Copy)]
 struct Hole {
     /// Row of the view.
@@ -257,8 +257,8 @@ pub fn squared_length(trial: &Trial, noise: &MapNoise) -> Option<f64> {
 }
 
 impl KeypointMap {
-    /// Replaces the noise by the one measured in trials; keeps it if there are too few trials. The map
-    /// has the frames of `mapping`.
+    /// Replaces the noise by the one measured in trials; keeps it if there are too few trials. The
+    /// map has the frames of `mapping`.
     pub fn measure_noise(&mut self, mapping: &Mapping<'_>) {
         if let Some(noise) = fitted_noise(&trials(self, mapping)) {
             self.noise = noise;

@@ -249,8 +249,8 @@ mod tests {
     }
 
     proptest! {
-        /// Oracle: the pose that the directions were computed from is among the solutions, and every
-        /// solution sees the points in these directions.
+        /// Oracle: the pose that the directions were computed from is among the solutions, and
+        /// every solution sees the points in these directions.
         #[test]
         fn the_true_pose_is_found(
             turn in vectors(3.0), shift in vectors(5.0),

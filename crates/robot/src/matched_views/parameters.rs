@@ -75,16 +75,17 @@ pub struct MatchingParameters {
     pub confident_inliers: usize,
     /// Minimum number of unique inliers of an accepted pose.
     pub min_inliers: usize,
-    /// Minimum number of unique inliers of an accepted pose times their spread, which is the product
-    /// of the standard deviations of their positions along both axes, fractions of the image's width
-    /// and height. A hundred inliers over the whole image have 8.
+    /// Minimum number of unique inliers of an accepted pose times their spread, which is the
+    /// product of the standard deviations of their positions along both axes, fractions of the
+    /// image's width and height. A hundred inliers over the whole image have 8.
     pub min_support: f64,
     /// Largest standard deviation of an accepted position, units (median depths of the map).
     pub max_position_deviation: f64,
     /// Largest standard deviation of an accepted rotation, radians.
     pub max_rotation_deviation_rad: f64,
     /// Smallest difference between the logarithms of the fitted and the stated focal length that
-    /// contradicts the stated one. Fitted focal lengths vary by up to 3 % far from the mapped frames.
+    /// contradicts the stated one. Fitted focal lengths vary by up to 3 % far from the mapped
+    /// frames.
     pub min_log_focal: f64,
     /// The same, in standard deviations for independent errors of the matches.
     pub min_focal_deviations: f64,

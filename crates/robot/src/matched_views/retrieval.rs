@@ -50,8 +50,8 @@ impl PlaceIndex {
         (self.centers.len() + self.rows.len()) * size_of::<f32>()
     }
 
-    /// Rows of the `count` frames most similar to a view with these compressed descriptors, the most
-    /// similar first.
+    /// Rows of the `count` frames most similar to a view with these compressed descriptors, the
+    /// most similar first.
     pub fn nearest(&self, descriptors: ArrayView2<'_, f32>, count: usize) -> Vec<usize> {
         self.nearest_among(descriptors, count, &|_| true)
     }

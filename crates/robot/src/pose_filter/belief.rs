@@ -43,11 +43,10 @@ const END_MOTIONS: usize = 24;
 /// Shortest time of a step, seconds.
 const LEAST_SECONDS: f64 = 1e-3;
 
-/// Pose, velocity, the correlated error of located poses, and the errors of measured motions, with the
-/// covariance of the errors of all four.
+/// Pose, velocity, the correlated error of located poses, and the errors of measured motions, with
+/// the covariance of the errors of all four.
 ///
-/// The pose error δ is in the body frame, true = pose · exp(δ), ordered (v, ω), in meters and
-/// radians.
+/// The pose error δ is in the body frame, true = pose · exp(δ), ordered (v, ω), meters and radians.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Belief {
     /// `parent_from_camera`.
@@ -56,9 +55,9 @@ pub struct Belief {
     pub velocity: Twist,
     /// Correlated error of located poses, in standard deviations of each pose.
     pub correlated_error: Vector6<f64>,
-    /// Errors of wheel odometry, in standard deviations of its drift: scale of the translations, scale
-    /// of the rotations, and rotation about each axis per meter. Then the error of the scale of visual
-    /// odometry, and the biases of gyroscope and accelerometer, in their standard deviations.
+    /// Errors of wheel odometry, in standard deviations of its drift: scale of the translations,
+    /// scale of the rotations, and rotation about each axis per meter. Then the error of the scale
+    /// of visual odometry, and the biases of gyroscope and accelerometer, in their deviations.
     pub motion_errors: SVector<f64, MOTION_ERRORS>,
     /// Of (pose, velocity, correlated error, motion errors); symmetric and positive definite.
     pub covariance: StateMatrix,
@@ -72,8 +71,7 @@ pub fn origin() -> PoseWithCovariance {
 /// The belief over one step of time, while observations are added.
 ///
 /// The error state is (initial pose, motion, final velocity, final correlated error, motion
-/// errors). The
-/// motion's error is in the final body frame.
+/// errors). The motion's error is in the final body frame.
 pub struct Step {
     /// The initial pose.
     start: Pose,
@@ -109,8 +107,8 @@ pub struct Observation<const N: usize> {
 impl Belief {
     /// A state with a known pose and unknown velocity: zero, with the covariance of the prior.
     ///
-    /// `correlated_share` is the share of the pose's variance that is the correlated error of located
-    /// poses; 0 for a pose from another source.
+    /// `correlated_share` is the share of the pose's variance that is the correlated error of
+    /// located poses; 0 for a pose from another source.
     pub fn at(place: &PoseWithCovariance, prior: &MotionPrior, correlated_share: f64) -> Self {
         let mut covariance = StateMatrix::zeros();
         let mut block = |row: usize, column: usize, of: &Matrix6<f64>| {
@@ -200,8 +198,8 @@ impl Belief {
 
     /// Predicts the state some seconds later.
     ///
-    /// The velocity is the Ornstein–Uhlenbeck process of `prior`. The correlated error decays over the
-    /// motion that the velocity predicts, by the correlation range of the parameters.
+    /// The velocity is the Ornstein–Uhlenbeck process of `prior`. The correlated error decays over
+    /// the motion that the velocity predicts, by the correlation range of the parameters.
     pub fn step(
         &self,
         prior: &MotionPrior,
@@ -213,8 +211,8 @@ impl Belief {
         self.step_by(predicted, seconds, inertia, parameters)
     }
 
-    /// As [`Belief::step`], but the prior tells nothing about the motion, which sensors measure: its
-    /// mean of zero would shorten it.
+    /// As [`Belief::step`], but the prior tells nothing about the motion, which sensors measure:
+    /// its mean of zero would shorten it.
     pub fn measured_step(
         &self,
         prior: &MotionPrior,
@@ -339,8 +337,7 @@ fn visual_noise(
 impl Step {
     /// The observation of a located pose.
     ///
-    /// Its error is L (√ρ · correlated error + √(1 − ρ) · noise) with L Lᵀ its covariance and ρ the
-    /// `correlated_share`.
+    /// Its error is L (√ρ · correlated error + √(1 − ρ) · noise), with covariance L Lᵀ and share ρ.
     pub fn located(&self, located: &PoseWithCovariance, correlated_share: f64) -> Observation<6> {
         let scale = correlated_scale(located, correlated_share);
         let mut derivative = self.end_derivative();
@@ -358,9 +355,9 @@ impl Step {
 
     /// The observation of the motion by wheel odometry, `start_from_end`.
     ///
-    /// The drift is a scale error of translations, a scale error of rotations, and a rotation per meter
-    /// forward, as those of a wrong wheel radius, a wrong track width and unequal wheels. The optical
-    /// axis points forward.
+    /// The drift is a scale error of translations, a scale error of rotations, and a rotation per
+    /// meter forward, as those of a wrong wheel radius, a wrong track width and unequal wheels. The
+    /// optical axis points forward.
     pub fn by_wheels(&self, motion: &Pose, drift: &Drift, noise: &Matrix6<f64>) -> Observation<6> {
         let Twist { linear, angular } = log(motion);
         let mut errors = SMatrix::<f64, 6, MOTION_ERRORS>::zeros();
@@ -437,8 +434,9 @@ impl Step {
         sum.map_or(f64::INFINITY, |sum| innovation.dot(&sum.solve(&innovation)))
     }
 
-    /// Kalman update; `factor` is on the covariance of the observation's noise. The observation is one
-    /// of the current state. Nothing changes if the sum of the covariances is not positive definite.
+    /// Kalman update; `factor` is on the covariance of the observation's noise. The observation is
+    /// one of the current state. Nothing changes if the sum of the covariances is not positive
+    /// definite.
     pub fn update<const N: usize>(&mut self, observed: &Observation<N>, factor: f64) {
         let noise = observed.noise * factor;
         let Some(sum) = Cholesky::new(self.state_covariance(observed) + noise) else {
@@ -459,7 +457,7 @@ impl Step {
         self.covariance = of_state + gain * noise * gain.transpose();
     }
 
-    /// The motion of the step, `start_from_end`. Time-correlated errors of located poses cancel in it.
+    /// The motion of the step, `start_from_end`. Correlated errors of located poses cancel in it.
     pub fn motion(&self) -> PoseWithCovariance {
         let covariance = self.covariance.fixed_view::<6, 6>(MOTION, MOTION);
         PoseWithCovariance {
@@ -470,8 +468,8 @@ impl Step {
 
     /// The state after the step.
     pub fn end(&self) -> Belief {
-        // The final pose error is the initial one in the new body frame, plus the motion's. The other rows
-        // stay as they are.
+        // The final pose error is the initial one in the new body frame, plus the motion's. The
+        // other rows stay as they are.
         const OTHERS: usize = STATE - VELOCITY;
         let end_from_start = adjoint(&self.motion.inverse());
         let joint = &self.covariance;

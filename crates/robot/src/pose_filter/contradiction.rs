@@ -19,19 +19,18 @@ pub struct Contradicted {
     pub inertia: bool,
 }
 
-/// Sums of the differences of two sensors each, and of motions. They are not saved in resume tokens.
+/// Sums of the differences of two sensors each, and of motions. Resume tokens do not save them.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Disagreements {
-    /// Differences over each of `disagreement_times_s`. While images move, the shorter time is
-    /// enough: the longer sum is then cleared.
+    /// Differences over each of `disagreement_times_s`. While images and wheels move and agree, the
+    /// shorter time is enough: the longer sum is then cleared.
     shorter: Differences,
     longer: Differences,
     /// Motions over the shorter time, or since a contradiction began.
     wheels: UncertainTwist,
     images: UncertainTwist,
-    /// Whether the longer sum has all differences since the contradiction began; false after a
-    /// stream was resumed.
-    is_complete: bool,
+    /// Time since the last motion of wheels, seconds; `None` without any.
+    since_wheels_s: Option<f64>,
 }
 
 /// Sums of the differences of two sensors each.
@@ -56,18 +55,35 @@ struct UncertainTwist {
 }
 
 impl UncertainTwist {
-    /// The difference of the twists of two sensors, whose errors are independent.
+    /// The difference of the twists of two sensors with independent errors.
     fn minus(&self, other: &Self) -> Self {
         // Only components that both measure: a gyroscope measures no translation.
-        let of = |value: Vector6<f64>| {
-            let is_measured = |axis: usize| self.variances[axis].min(other.variances[axis]) > 0.0;
-            Vector6::from_fn(|axis, _| if is_measured(axis) { value[axis] } else { 0.0 })
+        let is_common = |axis: usize| self.variances[axis].min(other.variances[axis]) > 0.0;
+        let common = |value: Vector6<f64>| {
+            Vector6::from_fn(|axis, _| if is_common(axis) { value[axis] } else { 0.0 })
         };
+
+        // Systematic errors of wheels and images scale with the true motion, here the smaller
+        // measured one. If one sensor rests, they are zero. Rotations also drift per meter.
+        let whole = |sensor: &Self| sensor.twist.norm();
+        let meters = |sensor: &Self| sensor.twist.fixed_rows::<3>(0).norm();
+        let share = |of: &Self, norm: fn(&Self) -> f64| {
+            norm(self).min(norm(other)) / norm(of).max(f64::MIN_POSITIVE)
+        };
+        let systematic = |of: &Self| {
+            if is_common(0) {
+                let shares = each(share(of, meters), share(of, whole));
+                of.lasting.component_mul(&shares)
+            } else {
+                of.lasting
+            }
+        };
+
         Self {
-            twist: of(self.twist - other.twist),
-            variances: of(self.variances + other.variances),
-            lasting: of(self.lasting.zip_map(&other.lasting, f64::hypot)),
-            ends: of(self.ends + other.ends),
+            twist: common(self.twist - other.twist),
+            variances: common(self.variances + other.variances),
+            lasting: common(systematic(self).zip_map(&systematic(other), f64::hypot)),
+            ends: common(self.ends + other.ends),
         }
     }
 
@@ -83,8 +99,8 @@ impl UncertainTwist {
     /// Adds the twist of one step. `decay` multiplies the sum so far. With `None`, during a
     /// contradiction, the sum does not decay and gets no more noise, so that rest does not end it.
     ///
-    /// Returns the squared length of the sum in standard deviations. If the sum of the true twists is
-    /// zero, it is χ² with one degree of freedom per measured component.
+    /// Returns the squared length of the sum in standard deviations. If the sum of the true twists
+    /// is zero, it is χ² with one degree of freedom per measured component.
     fn add(&mut self, decay: Option<f64>, step: Option<UncertainTwist>) -> f64 {
         let factor = decay.unwrap_or(1.0);
         self.twist *= factor;
@@ -123,11 +139,12 @@ impl Differences {
         step: &Measured,
         parameters: &FilterParameters,
     ) -> Contradicted {
+        let turned = step.inertia.or(step.wheels).or(step.images);
         let disagree = |sum: &mut UncertainTwist, a: Option<UncertainTwist>, b| {
-            let difference = a.zip(b).map(|(a, b)| {
-                sum.turn(&a.twist);
-                a.minus(&b)
-            });
+            if let Some(turned) = &turned {
+                sum.turn(&turned.twist);
+            }
+            let difference = a.zip(b).map(|(a, b)| a.minus(&b));
             sum.add(decay, difference) > parameters.outlier_gate
         };
         Contradicted::of_pairs(
@@ -142,9 +159,8 @@ impl Differences {
 impl Disagreements {
     /// Adds a step, and updates the contradicted sensors.
     ///
-    /// A contradiction ends when the images (else the wheels) have moved since it began and the
-    /// shorter sums agree, or when the longer sum is below the gate. Time alone does not end it: a
-    /// frozen picture agrees with wheels that pause.
+    /// A contradiction ends when the shorter sums agree and the sensors have moved since it began.
+    /// Rest does not end it: a frozen picture and paused wheels agree.
     fn add(
         &mut self,
         contradicted: &mut Contradicted,
@@ -154,16 +170,19 @@ impl Disagreements {
     ) {
         let [decay, slow_decay] = parameters
             .disagreement_times_s
-            .map(|time_s| Some((-seconds / time_s).exp()));
+            .map(|time_s| (-seconds / time_s).exp());
         let is_new = !contradicted.any();
-        let short = self.shorter.add(decay, step, parameters);
-        let long = (self.longer).add(slow_decay.filter(|_| is_new), step, parameters);
 
+        let short = self.shorter.add(Some(decay), step, parameters);
+        let while_agreeing = Some(slow_decay).filter(|_| is_new);
+        let long = self.longer.add(while_agreeing, step, parameters);
+
+        let decay = if is_new { decay } else { 1.0 };
         let moves = |sum: &mut UncertainTwist, twist: Option<UncertainTwist>| {
             // A systematic error scales a motion, but does not make one.
             let lasting = Vector6::zeros();
             let twist = twist.map(|twist| UncertainTwist { lasting, ..twist });
-            sum.add(decay.filter(|_| is_new), twist) > parameters.outlier_gate
+            sum.add(Some(decay), twist) > parameters.outlier_gate
         };
         let wheels = moves(&mut self.wheels, step.wheels);
         let images = moves(&mut self.images, step.images);
@@ -173,28 +192,40 @@ impl Disagreements {
             if short.any() {
                 self.longer = self.shorter;
             }
-            self.wheels.twist.fill(0.0);
-            self.images.twist.fill(0.0);
-            self.is_complete = true;
+            self.wheels = UncertainTwist::default();
+            self.images = UncertainTwist::default();
             *contradicted = found;
             return;
         }
 
-        let of_wheels = contradicted.any() && !contradicted.images;
-        let has_moved = if of_wheels { wheels } else { images };
+        // Wheels that were silent for the longer time are forgotten.
+        let silent_s = self.since_wheels_s.map(|silent_s| silent_s + seconds);
+        self.since_wheels_s = step.wheels.map(|_| 0.0).or(silent_s);
+        let [_, longer_s] = parameters.disagreement_times_s;
+        let wheels = wheels
+            || self
+                .since_wheels_s
+                .is_none_or(|silent_s| silent_s > longer_s);
+        let has_moved = match contradicted {
+            Contradicted { images: true, .. } => images && wheels,
+            Contradicted { wheels: true, .. } => wheels,
+            Contradicted { inertia: true, .. } => images || wheels,
+            _ => images && wheels,
+        };
+
         if has_moved && !short.any() {
             self.longer = Differences::default();
             *contradicted = Contradicted::default();
-        } else if found.any() || self.is_complete {
-            *contradicted = found;
+        } else if !is_new && long.any() {
+            *contradicted = long;
         }
     }
 }
 
 impl Contradicted {
-    /// Judges from which pairs of sensors disagree. The gyroscope decides between wheels and images.
-    /// If these two agree and both contradict it, the gyroscope is contradicted. Trusted wheels
-    /// are never contradicted.
+    /// Judges from which pairs of sensors disagree. The gyroscope decides between wheels and
+    /// images. If these two agree and both contradict it, the gyroscope is contradicted. Trusted
+    /// wheels are never contradicted.
     fn of_pairs(
         wheels_images: bool,
         inertia_images: bool,
@@ -210,7 +241,7 @@ impl Contradicted {
         let is_undecided = wheels_images && !inertia_images && !inertia_wheels;
         Self {
             wheels: (inertia_wheels || is_undecided) && !trust_wheels,
-            images: inertia_images || is_undecided,
+            images: inertia_images || is_undecided || (wheels_images && trust_wheels),
             inertia: inertia_wheels && trust_wheels,
         }
     }
@@ -233,8 +264,8 @@ impl Contradicted {
 }
 
 impl<'a> Motions<'a> {
-    /// Updates the contradicted sensors of the state, and returns the motions of the others. Wheels that
-    /// move faster than any robot, as after a restart, are left out too.
+    /// Updates the contradicted sensors of the state, and returns the motions of the others. Wheels
+    /// that move faster than any robot, as after a restart, are left out too.
     pub(super) fn consistent(
         self,
         state: &mut FilterState,

@@ -8,8 +8,8 @@ use nalgebra::{Matrix3, Unit, Vector3};
 use super::FilterParameters;
 use super::belief::{Observation, Step};
 
-/// Squared Mahalanobis length of a tilt above which gravity counts less: the 99 % quantile of χ² with two
-/// degrees of freedom.
+/// Squared Mahalanobis length of a tilt above which gravity counts less: the 99 % quantile of χ²
+/// with two degrees of freedom.
 const GATE: f64 = 9.21;
 
 /// The direction of gravity, as an accelerometer measures it in the camera's frame.
@@ -57,8 +57,7 @@ impl MeasuredGravity {
     }
 
     /// Corrects the tilt of a step. `seconds` is the time since the last measurement. Returns the
-    /// contradiction if gravity is outside the gate: the robot accelerates, or the sensor's axes are
-    /// wrong.
+    /// contradiction if gravity is outside the gate: the robot accelerates, or the axes are wrong.
     pub(super) fn correct(
         &self,
         step: &mut Step,

@@ -25,8 +25,8 @@ const OF_VELOCITY: usize = 6;
 pub struct MeasuredInertia {
     /// In the axes of the camera.
     pub motion: InertialMotion,
-    /// The direction of gravity in the parent frame of the belief; `None` if it is unknown: only the
-    /// gyroscope counts then.
+    /// The direction of gravity in the parent frame of the belief; `None` if it is unknown: only
+    /// the gyroscope counts then.
     pub down_in_parent: Option<Unit<Vector3<f64>>>,
 }
 
@@ -68,8 +68,8 @@ impl Corrected {
 }
 
 impl MeasuredInertia {
-    /// The prediction with the rotation of the gyroscope and, where the direction of gravity is known, the
-    /// translation of the accelerometer.
+    /// The prediction with the rotation of the gyroscope and, where the direction of gravity is
+    /// known, the translation of the accelerometer.
     pub(super) fn in_place_of(&self, mut predicted: Predicted, belief: &Belief) -> Predicted {
         let corrected = Corrected::of(&self.motion, belief);
         self.turn(&mut predicted, &corrected);
@@ -112,9 +112,9 @@ impl MeasuredInertia {
         rate.fill_diagonal(motion.last_rate_variance);
     }
 
-    /// Replaces translation and linear velocity. With the initial velocity v and gravity g, in the axes of
-    /// the start, the camera moves by v t + g t²/2 + position, and ends at the velocity
-    /// v + g t + velocity.
+    /// Replaces translation and linear velocity. With the initial velocity v and gravity g, in the
+    /// axes of the start, the camera moves by v t + g t²/2 + position, and ends at the velocity v +
+    /// g t + velocity.
     fn accelerate(
         &self,
         predicted: &mut Predicted,

@@ -11,10 +11,10 @@
 //! | client | initial pose | as stated |
 //!
 //! - A filter holds no data of a stream; they are in its [`FilterState`].
-//! - A located pose or a tilt beyond its gate counts less. A located pose that contradicts the belief
-//!   is not used. Several in a row that agree replace it.
+//! - A located pose or a tilt beyond its gate counts less. A located pose that contradicts the
+//!   belief is not used. Several in a row that agree replace it.
 //! - Measured motions replace the motion prior, which smooths the velocity.
-//! - `odom_from_camera` composes the motions without the located poses. It is continuous and drifts.
+//! - `odom_from_camera` composes the motions without located poses. It is continuous and drifts.
 
 mod belief;
 mod contradiction;
@@ -180,7 +180,6 @@ impl PoseFilter {
         state.is_placed = true;
         state.candidate = None;
         state.located_ns = state.last.map(|last| last.time_ns);
-        state.sight_ns = state.located_ns;
         state.is_carried = true;
     }
 
@@ -192,9 +191,8 @@ impl PoseFilter {
         state.seconds_to(time_ns, sequence).map(|_| ())
     }
 
-    /// The motion since the last frame as the sensors of a frame measure it, without its views: that of
-    /// wheel odometry, else the rotation of the gyroscope at the velocity of the stream. `None` without
-    /// either.
+    /// The motion since the last frame without its views: that of wheel odometry, else the rotation
+    /// of the gyroscope at the velocity of the stream. `None` without either.
     pub fn sensed_motion(&self, state: &FilterState, frame: &ViewObservation) -> Option<Pose> {
         let contradicted = state.contradicted;
         let seconds = state.seconds_to(frame.time_ns, frame.sequence).ok()?;
@@ -211,8 +209,8 @@ impl PoseFilter {
             .or(by_gyroscope.filter(|_| !contradicted.inertia))
     }
 
-    /// Velocity at the last frame in the camera's body frame, m/s and rad/s, with its covariance. Before the
-    /// first frame it is zero, with the covariance of the motion prior.
+    /// Velocity at the last frame in the camera's body frame, m/s and rad/s, with its covariance.
+    /// Before the first frame it is zero, with the covariance of the motion prior.
     pub fn velocity(&self, state: &FilterState) -> (Twist, Matrix6<f64>) {
         let prior = &self.rooms[state.room.unwrap_or(0)].motion_prior;
         state.belief.map_or_else(
@@ -257,8 +255,8 @@ impl PoseFilter {
         state.advance(frame);
         state.expire_candidate(frame, self.parameters.max_candidate_s);
 
-        // 1. Predict, by the motion prior of the room, or of the first room while it is unknown, and by
-        // the measured motions.
+        // 1. Predict, by the motion prior of the room, or of the first room while it is unknown,
+        // and by the measured motions.
         let prior = &self.rooms[state.room.unwrap_or(0)].motion_prior;
         let belief = state.belief.unwrap_or_else(|| Belief::at_origin(prior));
         let motions = motions.consistent(state, seconds, &self.parameters);
@@ -266,16 +264,13 @@ impl PoseFilter {
         if let Some(wheels) = &motions.wheels {
             state.wheel_motion = state.wheel_motion.and(log(&wheels.motion));
         }
-        // After a frame without a motion, the camera may be anywhere. The first image, or an identical
-        // one, has no motion to measure.
+        // After a frame without a motion, the camera may be anywhere. The first image, or an
+        // identical one, has no motion to measure.
         let has_no_motion = is_first || state.unchanged_frames > 0;
         // Wheels alone carry a pose that is not to be corrected, or if they are trusted.
         let is_driven =
             motions.wheels.is_some() && (!self.parameters.fuse || self.parameters.trust_wheels);
         state.is_carried &= motions.visual.is_some() || is_driven || has_no_motion;
-        if state.is_carried {
-            state.sight_ns = Some(frame.time_ns);
-        }
 
         // The odometry composes the measured motions: poses in the map do not move it.
         let motion = step.motion();
@@ -332,7 +327,7 @@ impl PoseFilter {
     }
 
     /// The located poses of a frame, with their innovations for a step. If keypoints locate the
-    /// leading view, and it is an outlier only because of visual odometry, returns the step without it.
+    /// leading view, and it is an outlier only by visual odometry, returns the step without that.
     fn judged<'a>(
         &self,
         state: &FilterState,
@@ -391,7 +386,7 @@ impl PoseFilter {
         new.into_iter().map(judged).collect()
     }
 
-    /// Corrects the step by the located poses of a frame. Only the first one may support a candidate.
+    /// Corrects the step by the located poses of a frame. Only the first may support a candidate.
     fn correct_by_views(
         &self,
         state: &mut FilterState,
@@ -440,8 +435,8 @@ impl PoseFilter {
         is_consistent
     }
 
-    /// The observation of one of `count` poses that together count as one: they share the correlated
-    /// part of the error.
+    /// The observation of one of `count` poses that together count as one: they share the
+    /// correlated part of the error.
     fn observed(&self, step: &Step, located: &LocatedPose, count: f64) -> Observation<6> {
         let share = self.parameters.correlated_share;
         let observed = step.located(&located.pose, share);
@@ -453,7 +448,7 @@ impl PoseFilter {
 
     /// Predicts a belief some seconds later: by the measured motions or, without any, by the motion
     /// prior. The prior smooths the velocity, unless an accelerometer measures how it changes.
-    /// `is_in_map` says whether the belief is in a room: only there the direction of gravity is known.
+    /// `is_in_map`: whether the belief is in a room. Only there the direction of gravity is known.
     fn predicted(
         &self,
         belief: &Belief,
@@ -495,9 +490,9 @@ impl PoseFilter {
 
     /// Corrects the step by the leading located pose.
     ///
-    /// Without a belief, or if the pose contradicts it, the pose supports a candidate. The same applies
-    /// if no view was located recently and the belief is uncertain, because almost any pose passes the
-    /// gate then.
+    /// Without a belief, or if the pose contradicts it, the pose supports a candidate. The same
+    /// applies if no view was located recently and the belief is uncertain, because almost any pose
+    /// passes the gate then.
     fn correct(
         &self,
         state: &mut FilterState,

@@ -4,8 +4,8 @@ use nalgebra::{Matrix6, Vector6};
 
 use seese3_core::geometry::{Pose, Twist, log};
 
-/// Parameters of a filter. In a file, the settings of one stream are left out: `trust_wheels`, the two of
-/// keyframes, and `fuse`.
+/// Parameters of a filter. In a file, the settings of one stream are left out: `trust_wheels`, the
+/// two of keyframes, and `fuse`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(
     feature = "serde",
@@ -13,16 +13,15 @@ use seese3_core::geometry::{Pose, Twist, log};
     serde(default, deny_unknown_fields)
 )]
 pub struct FilterParameters {
-    /// Share of the variance of a located pose that is correlated from view to view, 0 to 1. It is the
-    /// error of the map in view: a camera at rest does not average it out.
+    /// Share of the variance of a located pose that is correlated from view to view, 0 to 1. It is
+    /// the error of the map in view: a camera at rest does not average it out.
     pub correlated_share: f64,
     /// Motion, meters plus radians, over which the correlated part decays by a factor e.
     pub correlation_range: f64,
-    /// Number of consecutive located poses that must agree to start the tracking, or to replace a pose that
-    /// they contradict: of views matched by keypoints, and of the most similar mapped frames.
+    /// Number of consecutive located poses that must agree to start the tracking, or to replace a
+    /// pose that they contradict: by matched keypoints, and by the most similar mapped frames.
     pub views_to_agree: [u32; 2],
-    /// Factor on the process noise of the motion prior: a person turns and stops more abruptly than
-    /// a Gaussian process.
+    /// Factor on the process noise of the motion prior: people turn and stop abruptly.
     pub process_noise_factor: f64,
     /// Squared Mahalanobis length of an innovation above which a located pose counts less: its
     /// covariance is multiplied by the square of (squared length / gate).
@@ -32,11 +31,7 @@ pub struct FilterParameters {
     /// Maximum time between two poses that agree, seconds. After a longer gap, an uncertain belief
     /// needs `views_to_agree` poses again.
     pub max_candidate_s: f64,
-    /// Time without a located view and without visual odometry after which a stream is DEGRADED,
-    /// seconds.
-    pub max_unlocated_s: f64,
-    /// Correlation time of the direction of measured gravity, seconds. Its errors come mostly from
-    /// accelerations.
+    /// Correlation time of measured gravity, seconds. Most of its errors are accelerations.
     pub gravity_correlation_s: f64,
     /// Largest standard deviations of the position along any direction, meters, and of the rotation
     /// about any axis, radians, while TRACKING.
@@ -47,8 +42,8 @@ pub struct FilterParameters {
     pub visual_noise: MotionNoise,
     /// Factor on the stated covariance of visual odometry, which takes its matches as independent.
     pub visual_design_effect: f64,
-    /// Time for which wrong depths turn the translation of visual odometry the same way, seconds. Their
-    /// relative deviation is that of the scale.
+    /// Time for which wrong depths turn the translation of visual odometry the same way, seconds.
+    /// Their relative deviation is that of the scale.
     pub visual_depth_time_s: f64,
     /// Correlation time of the error of the scale of visual odometry, seconds.
     pub visual_scale_time_s: f64,
@@ -59,8 +54,8 @@ pub struct FilterParameters {
     /// Times over which the differences of two sensors are summed, seconds, the shorter one first.
     /// The longer one detects a frozen picture while the wheels move slowly.
     pub disagreement_times_s: [f64; 2],
-    /// Largest speed of a measured motion, meters per second and radians per second. A faster one is a
-    /// restart of the sensor.
+    /// Largest speed of a measured motion, meters per second and radians per second. A faster one
+    /// is a restart of the sensor.
     pub max_speed: f64,
     /// Number of repetitions of an image after which a stream is DEGRADED.
     pub max_unchanged_frames: u32,
@@ -86,7 +81,6 @@ impl Default for FilterParameters {
             gate: 16.81,
             outlier_gate: 67.24,
             max_candidate_s: 5.0,
-            max_unlocated_s: 0.1,
             gravity_correlation_s: 2.0,
             // Errors of 0.2 m and 10° are 2.6 standard deviations: rarer than 1 in 100.
             max_deviation: [0.077, 0.067],
@@ -106,8 +100,8 @@ impl Default for FilterParameters {
     }
 }
 
-/// Independent noise of measured motions: standard deviations per axis. Variances grow in proportion
-/// to the distance and the angle.
+/// Independent noise of measured motions: standard deviations per axis. Variances grow in
+/// proportion to the distance and the angle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct MotionNoise {
@@ -205,7 +199,6 @@ impl FilterParameters {
             ("gate", &positive, self.gate),
             ("outlier_gate", &positive, self.outlier_gate),
             ("max_candidate_s", &positive, self.max_candidate_s),
-            ("max_unlocated_s", &positive, self.max_unlocated_s),
             ("gravity_correlation_s", &positive, gravity_s),
             ("max_deviation[0]", &positive, deviation_m),
             ("max_deviation[1]", &positive, deviation_rad),

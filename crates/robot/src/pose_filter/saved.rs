@@ -14,18 +14,17 @@ const ROUNDING: f64 = 1e-5;
 
 /// The pose and velocity of a stream with their covariances, and its status.
 ///
-/// The pose is in double precision. Covariances are in single precision, without the correlation of pose and
-/// velocity. The odometry frame, the keyframe, candidates and learned errors of sensors are not saved.
+/// The pose is in double precision. Covariances are in single precision, without the correlation of
+/// pose and velocity. Odometry frame, keyframe, candidates and sensor errors are not saved.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct SavedState {
     /// The room of the pose, an index of the filter's rooms.
     pub room: Option<usize>,
-    /// `world_from_camera`, with the covariance of δ in true = pose · exp(δ); `None` without a pose.
+    /// `world_from_camera`, with the covariance of δ in true = pose · exp(δ), if it is known.
     pose: Option<SavedPose>,
     last: Option<LastView>,
     located_ns: Option<i64>,
-    sight_ns: Option<i64>,
     contradicted: Contradicted,
     unchanged_frames: u32,
     is_carried: bool,
@@ -58,7 +57,6 @@ impl FilterState {
             }),
             last: self.last,
             located_ns: self.located_ns,
-            sight_ns: self.sight_ns,
             contradicted: self.contradicted,
             unchanged_frames: self.unchanged_frames,
             is_carried: self.is_carried,
@@ -86,7 +84,6 @@ impl PoseFilter {
             belief,
             last: saved.last,
             located_ns: saved.located_ns,
-            sight_ns: saved.sight_ns,
             contradicted: saved.contradicted,
             unchanged_frames: saved.unchanged_frames,
             is_carried: saved.is_carried,

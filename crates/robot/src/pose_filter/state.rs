@@ -20,9 +20,9 @@ pub struct ViewObservation {
     pub time_ns: i64,
     /// Sequence number set by the sender.
     pub sequence: u64,
-    /// Poses of the stream's own camera by the views of this frame. The first one leads: only it may
-    /// start the tracking or replace a pose. Views of one frame have correlated errors: together
-    /// they count as one.
+    /// Poses of the stream's own camera by the views of this frame. The first one leads: only it
+    /// may start the tracking or replace a pose. Views of one frame have correlated errors:
+    /// together they count as one.
     pub located: Vec<LocatedPose>,
     /// The most similar mapped frame of all views.
     pub best_match: Option<BestMatch>,
@@ -30,8 +30,7 @@ pub struct ViewObservation {
     pub novelty: f64,
     /// Why no view is located; empty if one is.
     pub unlocated: String,
-    /// Equal for identical images of the stream's own camera. `None` for an image that shows
-    /// nothing.
+    /// Equal for identical images of the stream's own camera. `None` for a blank image.
     pub fingerprint: Option<u64>,
     /// The motion since the last frame by visual odometry, if its images agree.
     pub visual: Option<VisualMotion>,
@@ -109,10 +108,8 @@ pub struct FilterState {
     pub candidate: Option<FilterCandidate>,
     /// Time of the last frame whose located pose was used, nanoseconds on the sensor's clock.
     pub located_ns: Option<i64>,
-    /// Time of the last frame that was located or that visual odometry tracked, nanoseconds on the
-    /// sensor's clock.
-    pub sight_ns: Option<i64>,
-    /// Whether visual odometry has tracked every frame since the last located one.
+    /// Whether visual odometry, or wheels that are trusted, have measured the motion of every frame
+    /// since the last located one.
     pub is_carried: bool,
     /// The differences between the sensors of motions.
     pub disagreements: Disagreements,
@@ -191,7 +188,6 @@ impl FilterState {
             keyframe: None,
             candidate: None,
             located_ns: None,
-            sight_ns: None,
             is_carried: false,
             disagreements: Disagreements::default(),
             contradicted: Contradicted::default(),
@@ -281,7 +277,6 @@ impl FilterState {
     /// Notes that a view was located.
     pub(super) fn mark_located(&mut self, time_ns: i64) {
         self.located_ns = Some(time_ns);
-        self.sight_ns = Some(time_ns);
         self.is_carried = true;
     }
 
@@ -312,12 +307,10 @@ impl FilterState {
         // A pose set before the first frame counts as located at the first frame.
         if self.is_placed {
             self.located_ns.get_or_insert(frame.time_ns);
-            self.sight_ns.get_or_insert(frame.time_ns);
         }
     }
 
-    /// The keyframe of this frame, with the motion since. The frame itself may become the keyframe of
-    /// later ones.
+    /// The keyframe of this frame, with the motion since. The frame may become the next keyframe.
     pub(super) fn keyframe_with(
         &mut self,
         frame: &ViewObservation,

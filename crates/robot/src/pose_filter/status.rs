@@ -38,7 +38,7 @@ impl PoseFilter {
                 } else if frame.visual.is_some() {
                     "visual odometry carries the pose since the last located view"
                 } else {
-                    "a view was located, or the client has set the pose, a moment ago"
+                    "the image is the same as before, or the client has set the pose"
                 };
                 (Status::Tracking, reason.to_owned())
             }
@@ -77,7 +77,6 @@ impl PoseFilter {
         if is_blind && parameters.fuse {
             return Some(why_unlocated(state, frame));
         }
-        let since_s = |earlier: i64| frame.time_ns.abs_diff(earlier) as f64 * 1e-9;
         // Without the wheels, or the inertial sensor, images carry the pose.
         if state.contradicted.images && !parameters.trust_wheels {
             let reason = if state.contradicted.wheels {
@@ -105,14 +104,15 @@ impl PoseFilter {
             ));
         }
 
-        let unlocated_s = state.sight_ns.map_or(0.0, since_s);
-        (unlocated_s > parameters.max_unlocated_s).then(|| {
+        (!state.is_carried).then(|| {
+            let since_s = |earlier: i64| frame.time_ns.abs_diff(earlier) as f64 * 1e-9;
+            let unlocated_s = state.located_ns.map_or(0.0, since_s);
             let why = if parameters.fuse {
                 why_unlocated(state, frame)
             } else {
                 "corrections are disabled".to_owned()
             };
-            format!("no view has been located for {unlocated_s:.1} s: {why}")
+            format!("no view has been located for {unlocated_s:.2} s: {why}")
         })
     }
 }

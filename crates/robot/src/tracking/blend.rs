@@ -2,8 +2,8 @@
 //!
 //! The pose is a weighted mean (blend) of the three nearest frames. The size of its error is
 //! predicted from the distances of the frames and, above all, from their disagreement. The relation
-//! is fitted to the room itself: each sampled frame is queried with itself and its neighbors removed
-//! from the map.
+//! is fitted to the room itself: each sampled frame is queried with itself and its neighbors
+//! removed from the map.
 
 use nalgebra::{Matrix5, Matrix6, Vector5, Vector6};
 use ndarray::Array2;

@@ -49,7 +49,8 @@ impl<'a> MapQuery<'a> {
     }
 }
 
-/// Index of the mapped frames by PCA of the room's features, with the errors of the poses that it gives.
+/// Index of the mapped frames by PCA of the room's features, with the errors of the poses that it
+/// gives.
 struct AppearanceMap {
     appearance: Appearance,
     index: ExactIndex,

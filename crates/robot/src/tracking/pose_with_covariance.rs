@@ -31,8 +31,8 @@ impl PoseWithCovariance {
         }
     }
 
-    /// The pose after a motion `earlier_from_later` with an independent error, which is in the later
-    /// body frame.
+    /// The pose after a motion `earlier_from_later` with an independent error, which is in the
+    /// later body frame.
     #[must_use]
     pub fn composed(&self, motion: &Self) -> Self {
         let back = adjoint(&motion.pose.inverse());

@@ -25,8 +25,8 @@ const CANDIDATES: usize = 600;
 /// Minimum cosine of the descriptors of a match.
 const MIN_COSINE: f32 = 0.7;
 
-/// Standard deviation of a keypoint's position along one axis, pixels of an image that is 320 pixels
-/// wide.
+/// Standard deviation of a keypoint's position along one axis, pixels of an image that is 320
+/// pixels wide.
 const DEVIATION_PX: f64 = 0.7;
 
 /// Minimum sum of the match weights. Below it the matches are too few or contradict each other.

@@ -12,8 +12,8 @@ use super::Match;
 use seese3_core::geometry::Pose;
 
 /// Prior mean of log ρ, ρ the inverse depth in 1/m, at a point (x, y) in normalized coordinates:
-/// coefficients of 1, x, y, x², xy and y². The edges of an image are nearer than its center. Fitted to
-/// drawn rooms and one photographed room.
+/// coefficients of 1, x, y, x², xy and y². The edges of an image are nearer than its center. Fitted
+/// to drawn rooms and one photographed room.
 const LOG_INVERSE_DEPTH: [f64; 6] = [-0.9446, -0.1065, -0.0705, 0.4672, 0.0214, 0.2502];
 
 /// Candidate standard deviations of log ρ; the solution with the lowest cost is kept.

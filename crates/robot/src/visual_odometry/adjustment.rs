@@ -51,8 +51,9 @@ impl LocalMap {
         }
     }
 
-    /// Adjusts the newest keyframes and the landmarks that they show, and removes outliers. If only the first
-    /// keyframe is fixed, it also tries the reversed scene. Returns whether the reversed scene was accepted.
+    /// Adjusts the newest keyframes and the landmarks that they show, and removes outliers. If only
+    /// the first keyframe is fixed, it also tries the reversed scene. Returns whether the reversed
+    /// scene was accepted.
     pub fn adjust(&mut self, focal_px: f64, parameters: &OdometryParameters) -> bool {
         let count = self.keyframes.len();
         if count < 2 {
@@ -104,7 +105,8 @@ impl LocalMap {
         is_reversed
     }
 
-    /// The landmarks that the keyframes from `first` on show, with a known depth or enough parallax.
+    /// The landmarks that the keyframes from `first` on show, with a known depth or enough
+    /// parallax.
     fn adjustable(
         &self,
         first: usize,
@@ -213,8 +215,8 @@ mod tests {
     use super::*;
     use crate::matched_views::{pixel_focal, plane_points};
 
-    /// Oracle: the true pose, 0.3 m to the side. The map holds the reversed scene: the camera on the other
-    /// side, turned by 0.15 rad, and near points far away.
+    /// Oracle: the true pose, 0.3 m to the side. The map holds the reversed scene: the camera on
+    /// the other side, turned by 0.15 rad, and near points far away.
     #[test]
     fn a_reversed_map_is_reversed() {
         let scene = Scene::in_box(300, 1);

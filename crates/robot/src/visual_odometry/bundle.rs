@@ -1,7 +1,7 @@
 //! Bundle adjustment: camera poses and landmark depths that explain the matched keypoints best.
 //!
-//! A landmark lies on the ray of a keypoint of one camera, its anchor, at an unknown inverse depth ρ
-//! with a Gaussian prior. The depths are eliminated from the normal equations (Schur complement).
+//! A landmark lies on the ray of a keypoint of one camera, its anchor, at an unknown inverse depth
+//! ρ with a Gaussian prior. The depths are eliminated from the normal equations (Schur complement).
 //! Reprojection errors have Student-t weights.
 
 use nalgebra::{
@@ -54,8 +54,9 @@ pub(super) struct BundleLandmark {
 pub(super) enum Objective {
     /// The posterior of poses and depths together. It suits landmarks with enough parallax.
     Joint,
-    /// The posterior of the poses, with the depths integrated out (Laplace's approximation). Without
-    /// parallax, the joint posterior prefers any translation to none: each depth absorbs some noise.
+    /// The posterior of the poses, with the depths integrated out (Laplace's approximation).
+    /// Without parallax, the joint posterior prefers any translation to none: each depth absorbs
+    /// some noise.
     Marginal,
 }
 
@@ -152,9 +153,10 @@ impl Bundle {
         self.adjust(steps);
     }
 
-    /// The bundle with the relief of the scene reversed: near landmarks are far, and the free cameras move
-    /// to the opposite side of the last fixed one. Both explain small parallax almost equally well (the
-    /// reversal of Necker's cube), so an adjustment that starts at one of them does not find the other.
+    /// The bundle with the relief of the scene reversed: near landmarks are far, and the free
+    /// cameras move to the opposite side of the last fixed one. Both explain small parallax almost
+    /// equally well (the reversal of Necker's cube), so an adjustment that starts at one of them
+    /// does not find the other.
     pub fn reversed(&self) -> Self {
         let mut reversed = self.clone();
         let Some(first_free) = self.is_free.iter().position(|is_free| *is_free) else {
@@ -475,8 +477,8 @@ mod tests {
 
     const FOCAL_PX: f64 = 300.0;
 
-    /// Four cameras with these steps between them, and 80 points 1.5 to 4 m away. The first camera is
-    /// fixed. Every landmark is anchored at one of the first two.
+    /// Four cameras with these steps between them, and 80 points 1.5 to 4 m away. The first camera
+    /// is fixed. Every landmark is anchored at one of the first two.
     fn scene(step: [f64; 6], noise_px: f64) -> Bundle {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
         let step = exp(&Twist::from_vector(&Vector6::from(step)));
@@ -566,8 +568,8 @@ mod tests {
         assert!((row.by_depth - expected).norm() < 1e-4);
     }
 
-    /// Oracle: the scene that made the observations. The priors of the depths, whose means are right,
-    /// determine the scale.
+    /// Oracle: the scene that made the observations. The priors of the depths, whose means are
+    /// right, determine the scale.
     #[test]
     fn an_adjustment_finds_the_scene() {
         let truth = scene(ARC, 0.0);
@@ -589,8 +591,8 @@ mod tests {
         }
     }
 
-    /// Oracle: the motion, a rotation without translation. The joint posterior would explain noise by
-    /// a translation at any depths.
+    /// Oracle: the motion, a rotation without translation. The joint posterior would explain noise
+    /// by a translation at any depths.
     #[test]
     fn a_rotation_is_no_translation() {
         let truth = scene([0.0, 0.0, 0.0, 0.0, 0.05, 0.0], 1.0);
@@ -617,8 +619,8 @@ mod tests {
         assert!(joint > 2.0 * marginal, "{joint} {marginal}");
     }
 
-    /// Oracle: the true path, sideways and with little parallax. An adjustment that starts at the reversed
-    /// scene stays there, at a higher cost; reversed again, it finds the path.
+    /// Oracle: the true path, sideways and with little parallax. An adjustment that starts at the
+    /// reversed scene stays there, at a higher cost; reversed again, it finds the path.
     #[test]
     fn a_reversed_scene_is_left_by_reversing_it() {
         let mut scene = scene([0.02, 0.0, 0.0, 0.0, 0.0, 0.0], 0.2);

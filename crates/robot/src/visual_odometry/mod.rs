@@ -2,12 +2,12 @@
 //!
 //! - The keypoints of a keyframe are landmarks on their rays. A landmark without parallax has the
 //!   usual depth of rooms, with a wide deviation.
-//! - A frame is matched with the landmarks near their predicted positions. A robust adjustment gives
-//!   its pose; far from the prediction it starts at the pose of P3P in LO-RANSAC.
+//! - A frame is matched with the landmarks near their predicted positions. A robust adjustment
+//!   gives its pose; far from the prediction it starts at the pose of P3P in LO-RANSAC.
 //! - A frame with enough parallax, or with too few matches left, becomes a keyframe. The newest
 //!   keyframes and their landmarks are then adjusted together.
-//! - Known depths, for example of keypoints that are matched with a map, set the scale. Without them
-//!   it is that of the usual depth of rooms, and drifts.
+//! - Known depths, for example of keypoints that are matched with a map, set the scale. Without
+//!   them it is that of the usual depth of rooms, and drifts.
 
 mod adjustment;
 mod bundle;
@@ -69,8 +69,8 @@ pub struct KnownDepth {
 pub struct VisualMotion {
     /// `last_from_this`, the pose of the frame in the camera frame of the last one.
     pub motion: Pose,
-    /// Covariance of δ in true = pose · exp(δ) of the frame in the local map, ordered (v, ω), meters
-    /// and radians. The drift of the local map is not part of it.
+    /// Covariance of δ in true = pose · exp(δ) of the frame in the local map, ordered (v, ω),
+    /// meters and radians. The drift of the local map is not part of it.
     pub pose_covariance: Matrix6<f64>,
     /// Relative standard deviation of the scale.
     pub scale_deviation: f64,
@@ -233,22 +233,22 @@ impl VisualOdometry {
         }
     }
 
-    /// Adds a frame without a usable image, some seconds after the last one: the camera is predicted to keep
-    /// its velocity.
+    /// Adds a frame without a usable image, some seconds after the last one: the camera is
+    /// predicted to keep its velocity.
     pub fn skip(&mut self, seconds: f64) {
         self.repeat(seconds);
         self.lose();
     }
 
-    /// Adds a frame whose image is the last one again. It is as [`Self::skip`], but the frame does not count
-    /// as lost.
+    /// Adds a frame whose image is the last one again. It is as [`Self::skip`], but the frame does
+    /// not count as lost.
     pub fn repeat(&mut self, seconds: f64) {
         self.untracked_s += seconds;
         self.predict(self.pose * exp(&self.velocity.scaled(seconds)));
     }
 
-    /// Sets the motion to the last frame to this estimate if the images gave none. The motion to the next
-    /// tracked frame then corrects it.
+    /// Sets the motion to the last frame to this estimate if the images gave none. The motion to
+    /// the next tracked frame then corrects it.
     pub fn assume(&mut self, motion: &Pose) {
         if let Some(before) = self.before {
             self.pose = before * motion;
@@ -370,8 +370,8 @@ impl VisualOdometry {
     /// `min_known_landmarks`, then fits the other depths to it. Otherwise uses all landmarks.
     ///
     /// Landmarks of unknown depth are left out because their prior has independent deviations. True
-    /// depths deviate from it together, as those of a wall, and the adjustment would explain that by a
-    /// rotation.
+    /// depths deviate from it together, as those of a wall, and the adjustment would explain that
+    /// by a rotation.
     fn posed(&self, mut bundle: Bundle, matches: &[FrameMatch]) -> Option<PosedFrame> {
         let parameters = &self.parameters;
         let is_known = |match_: &FrameMatch| {

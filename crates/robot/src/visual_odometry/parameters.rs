@@ -3,14 +3,14 @@
 #[cfg(doc)]
 use seese3_core::epipolar::PIXEL_IMAGE_WIDTH;
 
-/// Parameters of visual odometry. `seese3 evaluate odometry` measures what they do. Pixels are those
-/// of an image that is [`PIXEL_IMAGE_WIDTH`] pixels wide.
+/// Parameters of visual odometry. `seese3 evaluate odometry` measures what they do. Pixels are
+/// those of an image that is [`PIXEL_IMAGE_WIDTH`] pixels wide.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OdometryParameters {
     /// Number of keypoints with the highest scores that are matched.
     pub candidates: usize,
-    /// Number of keyframes near the predicted pose whose landmarks are matched. It is doubled, without
-    /// a limit on the distance, if they give too few inliers.
+    /// Number of keyframes near the predicted pose whose landmarks are matched. It is doubled,
+    /// without a limit on the distance, if they give too few inliers.
     pub near_keyframes: usize,
     /// Largest distance of a match from its predicted position, pixels.
     pub search_radius_px: f64,
@@ -41,14 +41,15 @@ pub struct OdometryParameters {
     pub depth_deviations: [f64; 2],
     /// Relative standard deviation below which a landmark's inverse depth counts as known.
     pub known_depth_deviation: f64,
-    /// Minimum number of matched landmarks of known depth for a pose that is estimated from them alone.
+    /// Minimum number of matched landmarks of known depth for a pose that is estimated from them
+    /// alone.
     pub min_known_landmarks: usize,
     /// Smallest parallax of a landmark of unknown depth that an adjustment uses, pixels.
     pub min_parallax_px: f64,
     /// Number of frames in succession without a pose after which the local map begins anew.
     pub max_lost_frames: u32,
-    /// Relative standard deviation of the scale: without any known depth, of one frame's known depths,
-    /// and its growth over one keyframe without them.
+    /// Relative standard deviation of the scale: without any known depth, of one frame's known
+    /// depths, and its growth over one keyframe without them.
     pub scale_deviations: ScaleDeviations,
     /// Minimum number of landmarks with known depths that determine the scale.
     pub min_known_depths: usize,

@@ -34,8 +34,8 @@ fn fitted(room: &Room, features: &Features, base: Option<&Arc<Adapter>>) -> Fitt
 }
 
 /// Oracle: the true poses of the frames that are not mapped, which the fit never saw, and the pose
-/// of the frame whose feature is nearest: a reading has to come nearer than that, and as near as its
-/// covariance says.
+/// of the frame whose feature is nearest: a reading has to come nearer than that, and as near as
+/// its covariance says.
 #[test]
 fn views_between_mapped_frames_are_located() {
     let (room, features) = served("hall");

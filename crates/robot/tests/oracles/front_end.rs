@@ -116,8 +116,8 @@ impl Stream {
     }
 }
 
-/// Oracle: the true lengths. Without depths they are those of the usual depth of rooms, which is not that of
-/// this scene.
+/// Oracle: the true lengths. Without depths they are those of the usual depth of rooms, which is
+/// not that of this scene.
 #[test]
 fn depths_of_a_sensor_set_the_scale() {
     let [with, without] = [true, false].map(|has_depths| {
@@ -132,8 +132,9 @@ fn depths_of_a_sensor_set_the_scale() {
     assert!(without > 0.1, "{without}");
 }
 
-/// Oracle: the true path. After three frames without an image the local map is found again, and corrects what
-/// was assumed meanwhile. After twelve it begins anew, with an image that tells no motion.
+/// Oracle: the true path. After three frames without an image the local map is found again, and
+/// corrects what was assumed meanwhile. After twelve it begins anew, with an image that tells no
+/// motion.
 #[test]
 fn a_local_map_outlives_a_short_gap() {
     let mut stream = Stream::new();
@@ -157,8 +158,8 @@ fn a_local_map_outlives_a_short_gap() {
     assert!(stream.read(false).motion.is_some());
 }
 
-/// Oracle: the true motions. A depth camera states ten times the depths: where the view is located, the map has
-/// them, and the lengths are right; without the map they are wrong.
+/// Oracle: the true motions. A depth camera states ten times the depths: where the view is located,
+/// the map has them, and the lengths are right; without the map they are wrong.
 #[test]
 fn the_depths_of_a_located_view_are_those_of_the_map() {
     let stream = Stream::new();

@@ -100,8 +100,8 @@ fn samples_of_a_known_flight_give_its_motion() {
     }
 }
 
-/// Oracle: the definition: without a sample before the first frame, or with a gap of more than 0.1 s, the
-/// motion is not measured.
+/// Oracle: the definition: without a sample before the first frame, or with a gap of more than 0.1
+/// s, the motion is not measured.
 #[test]
 fn missing_samples_are_not_replaced() {
     let flight = Flight::new();
@@ -160,7 +160,8 @@ fn the_derivatives_by_biases_are_those_of_the_integration() {
     }
 }
 
-/// Oracle: simulation. The mean squared Mahalanobis length of the errors is the number of dimensions.
+/// Oracle: simulation. The mean squared Mahalanobis length of the errors is the number of
+/// dimensions.
 #[test]
 fn the_covariance_is_that_of_noisy_samples() {
     let flight = Flight::new();
@@ -194,8 +195,8 @@ fn the_covariance_is_that_of_noisy_samples() {
             error.dot(&(information * error))
         })
         .collect();
-    // The standard deviation of the mean is √(2 · 9 / 400) = 0.2; interpolation averages the noise of
-    // neighboring samples, which makes the covariance a little too large.
+    // The standard deviation of the mean is √(2 · 9 / 400) = 0.2; interpolation averages the noise
+    // of neighboring samples, which makes the covariance a little too large.
     let mean = mean(&lengths);
     assert!((8.0..9.7).contains(&mean), "{mean}");
 }
@@ -259,8 +260,8 @@ fn frame(number: u64, pose: Option<Pose>) -> ViewObservation {
     }
 }
 
-/// Oracle: the flight. For 2 s after 3 s of located views there is no image. The inertial sensor has
-/// biases, which it learns from the located views.
+/// Oracle: the flight. For 2 s after 3 s of located views there is no image. The inertial sensor
+/// has biases, which it learns from the located views.
 #[test]
 fn an_inertial_sensor_carries_the_pose_in_the_dark() {
     let flight = Flight::new();
@@ -315,8 +316,8 @@ fn an_inertial_sensor_carries_the_pose_in_the_dark() {
     }
 }
 
-/// Oracle: the contract: two sensors outvote the third, which is named; a gyroscope is believed against
-/// one other; trusted wheels are never left out.
+/// Oracle: the contract: two sensors outvote the third, which is named; a gyroscope is believed
+/// against one other; trusted wheels are never left out.
 #[test]
 fn the_sensor_that_contradicts_the_others_is_named() {
     let twist = Twist {
@@ -342,7 +343,7 @@ fn the_sensor_that_contradicts_the_others_is_named() {
 
     // Wheels, images and gyroscope move or stand still; the located views show the motion.
     let (go, no) = (Some(&twist), Some(&still));
-    let cases: [(_, _, _, bool, &[Sensor], Status); 7] = [
+    let cases: [(_, _, _, bool, &[Sensor], Status); 8] = [
         (go, go, go, false, &[], Status::Tracking),
         (no, go, go, false, &[Sensor::Wheels], Status::Tracking),
         (go, no, go, false, &[Sensor::Images], Status::Degraded),
@@ -357,6 +358,14 @@ fn the_sensor_that_contradicts_the_others_is_named() {
             Status::Degraded,
         ),
         (go, no, None, true, &[Sensor::Images], Status::Tracking),
+        (
+            go,
+            no,
+            no,
+            true,
+            &[Sensor::Images, Sensor::Inertia],
+            Status::Tracking,
+        ),
     ];
     for (case, (wheels, images, gyroscope, trust, expected, status)) in
         cases.into_iter().enumerate()
@@ -394,8 +403,9 @@ fn the_sensor_that_contradicts_the_others_is_named() {
     }
 }
 
-/// Oracle: the definition of a scale error: it is the same at every step. Images whose scale is known to a
-/// third and that are three times too long do not contradict wheels; images whose scale is known to 3 % do.
+/// Oracle: the definition of a scale error: it is the same at every step. Images whose scale is
+/// known to a third and that are three times too long do not contradict wheels; images whose scale
+/// is known to 3 % do.
 #[test]
 fn a_wrong_scale_of_unknown_depths_is_no_contradiction() {
     let filter = filter(false);
@@ -430,8 +440,8 @@ fn a_wrong_scale_of_unknown_depths_is_no_contradiction() {
     }
 }
 
-/// Oracle: the contract: a contradiction is one of the last second. Wheels that slipped, fell silent for a
-/// minute and then agree are used at once.
+/// Oracle: the contract: a contradiction is one of the last second. Wheels that slipped, fell
+/// silent for a minute and then agree are used at once.
 #[test]
 fn a_contradiction_is_forgotten_while_a_sensor_is_silent() {
     let filter = filter(false);
@@ -466,8 +476,8 @@ fn a_contradiction_is_forgotten_while_a_sensor_is_silent() {
     }
 }
 
-/// Oracle: central differences of the predicted pose and velocity, by the initial pose, the velocity and
-/// the biases.
+/// Oracle: central differences of the predicted pose and velocity, by the initial pose, the
+/// velocity and the biases.
 #[test]
 fn the_predicted_covariance_is_that_of_the_differences() {
     let flight = Flight::new();
@@ -518,8 +528,8 @@ fn the_predicted_covariance_is_that_of_the_differences() {
     }
 }
 
-/// Oracle: the contract of trusted wheels. Views that agree on a place 1 m away replace the pose that
-/// plain wheels carry, and only are a candidate beside trusted ones.
+/// Oracle: the contract of trusted wheels. Views that agree on a place 1 m away replace the pose
+/// that plain wheels carry, and only are a candidate beside trusted ones.
 #[test]
 fn views_do_not_replace_a_pose_that_trusted_wheels_carry() {
     let there = Pose::translation(1.0, 0.0, 0.0);
@@ -557,8 +567,8 @@ fn views_do_not_replace_a_pose_that_trusted_wheels_carry() {
     }
 }
 
-/// Oracle: the definition: over a time t, a velocity with the covariance Σ moves the camera with the
-/// covariance Σ t². The drift is negligible.
+/// Oracle: the definition: over a time t, a velocity with the covariance Σ moves the camera with
+/// the covariance Σ t². The drift is negligible.
 #[test]
 fn a_covariance_of_velocities_is_that_of_the_motion() {
     let filter = filter(false);

@@ -25,8 +25,8 @@ fn similar(novelty: Option<f64>) -> AdapterEstimate {
     }
 }
 
-/// Oracle: the rules of [`PoseEstimate::choose`]. Similar frames give a pose up to a novelty of 1; if it
-/// is unknown, only without keypoints; and never for a contradicted camera.
+/// Oracle: the rules of [`PoseEstimate::choose`]. Similar frames give a pose up to a novelty of 1;
+/// if it is unknown, only without keypoints; and never for a contradicted camera.
 #[test]
 fn similar_frames_answer_only_for_views_that_resemble_the_room() {
     let answers = |unmatched: Option<NotLocated>, novelty: Option<f64>| {

@@ -198,8 +198,8 @@ fn a_view_with_exact_keypoints_is_located_within_a_millimeter() {
 }
 
 /// Oracle: the definition of a covariance. Squared Mahalanobis lengths of errors in six dimensions
-/// have the mean 6; a mean of 40 has the standard deviation 0.55. The fit with heavy tails may state
-/// up to 1.7 times the variance of normal errors.
+/// have the mean 6; a mean of 40 has the standard deviation 0.55. The fit with heavy tails may
+/// state up to 1.7 times the variance of normal errors.
 #[test]
 fn errors_under_pixel_noise_agree_with_the_covariance() {
     let world = World::new(Scene::in_box(POINTS, 1), camera_path(80), 0.5);
@@ -300,8 +300,8 @@ fn without_keypoints_there_is_neither_a_map_nor_a_pose() {
     assert_eq!(refused.unwrap_err(), NotLocated::NoKeypoints);
 }
 
-/// Oracle: depth needs views from two places. One camera, cameras in one place and cameras that only
-/// turn have none; points at infinity look the same from everywhere.
+/// Oracle: depth needs views from two places. One camera, cameras in one place and cameras that
+/// only turn have none; points at infinity look the same from everywhere.
 #[test]
 fn a_map_without_a_baseline_has_no_depths() {
     let one_place: Vec<Pose> = vec![Pose::identity(); 12];
@@ -332,8 +332,8 @@ fn a_map_without_a_baseline_has_no_depths() {
     }
 }
 
-/// Oracle: the true poses of the views. The positions of a camera that only turns differ by the noise
-/// of its poses; depths from such baselines must not place a view somewhere else.
+/// Oracle: the true poses of the views. The positions of a camera that only turns differ by the
+/// noise of its poses; depths from such baselines must not place a view somewhere else.
 #[test]
 fn a_turning_camera_with_noisy_positions_gives_no_wrong_pose() {
     for (count, jitter_m) in [1e-9, 1e-6, 1e-3, 5e-3]
@@ -371,7 +371,8 @@ fn row_of_poses(count: usize, spacing_m: f64) -> Vec<Pose> {
 }
 
 /// Oracle: the depths of the scene's points, and the true pose of the view. Few frames are farther
-/// apart than half of the unit that their spread suggests, but not than half of the median depth, 4 m.
+/// apart than half of the unit that their spread suggests, but not than half of the median depth, 4
+/// m.
 #[test]
 fn a_map_of_few_frames_has_the_depths_of_the_scene() {
     for count in 2..=5 {
@@ -394,8 +395,8 @@ fn a_map_of_few_frames_has_the_depths_of_the_scene() {
     }
 }
 
-/// Oracle: the true poses of the views. The noise of a map of two frames is not measured, so that its
-/// covariance is that of a typical map.
+/// Oracle: the true poses of the views. The noise of a map of two frames is not measured, so that
+/// its covariance is that of a typical map.
 #[test]
 fn a_noisy_map_of_two_frames_gives_no_confident_wrong_pose() {
     for spacing_m in [0.2, 0.4, 0.8] {
@@ -416,8 +417,8 @@ fn a_noisy_map_of_two_frames_gives_no_confident_wrong_pose() {
     }
 }
 
-/// Oracle: the definition of the largest baseline, half of the median depth. The points are 2 to 6 m
-/// deep, the cameras 3.2 m apart.
+/// Oracle: the definition of the largest baseline, half of the median depth. The points are 2 to 6
+/// m deep, the cameras 3.2 m apart.
 #[test]
 fn a_map_of_two_frames_too_far_apart_refuses_views() {
     let world = World::new(Scene::in_box(POINTS, 1), row_of_poses(2, 3.2), 0.0);
@@ -489,8 +490,8 @@ fn a_view_of_another_scene_is_refused() {
     }
 }
 
-/// Fails if a located view is more than 6 standard deviations from its true pose. `cameras` are those
-/// that are stated for the map and for the view.
+/// Fails if a located view is more than 6 standard deviations from its true pose. `cameras` are
+/// those that are stated for the map and for the view.
 #[track_caller]
 fn assert_no_confident_wrong_pose(world: &World, cameras: [CameraIntrinsics; 2]) {
     let [of_map, of_view] = cameras;
@@ -557,7 +558,8 @@ fn a_wrong_focal_length_of_a_view_is_refused_by_name() {
     }
 }
 
-/// Oracle: the true focal length of the views: images are zoomed, and the camera of the map is stated.
+/// Oracle: the true focal length of the views: images are zoomed, and the camera of the map is
+/// stated.
 #[test]
 fn zoomed_images_of_the_mapping_camera_are_refused_by_name() {
     let world = World::exact();
@@ -661,8 +663,8 @@ fn the_focal_length_of_an_unknown_camera_is_estimated() {
     assert!(none.is_none());
 }
 
-/// A trial with the given information; its error is drawn from Student's t distribution with 5 degrees
-/// of freedom and the covariance that `noise` gives.
+/// A trial with the given information; its error is drawn from Student's t distribution with 5
+/// degrees of freedom and the covariance that `noise` gives.
 fn drawn_trial(information: PoseInformation, noise: &MapNoise, random: &mut Random) -> Trial {
     let root = information.covariance(noise).unwrap().cholesky().unwrap();
     let normal = Vector6::from_fn(|_, _| random.normal());
@@ -711,9 +713,9 @@ const DRAWN: MapNoise = MapNoise {
     relative_error: 0.01,
 };
 
-/// Oracle: the noise from which the errors are drawn. Its 95 % ellipsoids hold 90.5 % of them, as
-/// 6 F(6, 5) · 3/5 has its 90.5 % quantile where χ² has that of 95 %; the 93 % quantile is 1.19 times as
-/// large (SciPy 1.17, `scipy.stats.f`). The fitted noise is scaled by that.
+/// Oracle: the noise from which the errors are drawn. Its 95 % ellipsoids hold 90.5 % of them, as 6
+/// F(6, 5) · 3/5 has its 90.5 % quantile where χ² has that of 95 %; the 93 % quantile is 1.19 times
+/// as large (SciPy 1.17, `scipy.stats.f`). The fitted noise is scaled by that.
 #[test]
 fn the_noise_of_drawn_trials_is_found() {
     let trials = drawn_trials(&DRAWN, 2_000);
@@ -734,8 +736,8 @@ fn the_noise_of_drawn_trials_is_found() {
     assert_eq!(fitted_noise(&trials[..29]), None);
 }
 
-/// Oracle: the noise from which the errors are drawn. Without one of its parts, the ellipsoids do not
-/// hold their shares of the errors.
+/// Oracle: the noise from which the errors are drawn. Without one of its parts, the ellipsoids do
+/// not hold their shares of the errors.
 #[test]
 fn each_part_of_the_noise_is_needed() {
     let trials = drawn_trials(&DRAWN, 1_000);
@@ -773,8 +775,8 @@ fn stated_with(poses: &[Pose], mut error: impl FnMut() -> Pose) -> Vec<Pose> {
     poses.iter().map(|pose| pose * error()).collect()
 }
 
-/// Oracle: the definition of a covariance, for views whose true pose is stated with the errors of the
-/// map. The errors of the poses are independent, or drift like a random walk.
+/// Oracle: the definition of a covariance, for views whose true pose is stated with the errors of
+/// the map. The errors of the poses are independent, or drift like a random walk.
 #[test]
 fn errors_of_stated_poses_are_part_of_the_covariance() {
     let world = World::new(Scene::in_box(POINTS, 1), camera_path(120), 0.5);
@@ -817,8 +819,8 @@ fn errors_of_stated_poses_are_part_of_the_covariance() {
     }
 }
 
-/// Oracle: the similarity between the two world frames. The second map shows the same scene from other
-/// cameras, in another world frame and scale. A map of another scene is refused.
+/// Oracle: the similarity between the two world frames. The second map shows the same scene from
+/// other cameras, in another world frame and scale. A map of another scene is refused.
 #[test]
 fn two_maps_of_one_scene_are_aligned() {
     let scene = Scene::in_box(POINTS, 1);

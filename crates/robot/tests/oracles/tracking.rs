@@ -233,8 +233,9 @@ fn odom_never_jumps() {
     assert!(PoseError::between(&last, &room.poses()[FRAMES - 1]).translation_m < 0.3);
 }
 
-/// Oracle: the contract. Views that turn slowly into those of another place correct nothing any more:
-/// the status is not TRACKING, and the covariance grows. In the room again, the camera is tracked.
+/// Oracle: the contract. Views that turn slowly into those of another place correct nothing any
+/// more: the status is not TRACKING, and the covariance grows. In the room again, the camera is
+/// tracked.
 #[test]
 fn a_camera_that_leaves_the_room_is_not_tracked() {
     let adapter = Arc::new(calibrated().0);
@@ -323,9 +324,9 @@ fn the_localizer_of_a_room_gives_the_poses() {
     assert!(error.translation_m > 0.8, "{error:?}");
 }
 
-/// Oracle: the true poses, which the matched keypoints give. They prove the place although the latents
-/// are those of no place; two that agree start the tracking; another place is only believed once two
-/// agree on it.
+/// Oracle: the true poses, which the matched keypoints give. They prove the place although the
+/// latents are those of no place; two that agree start the tracking; another place is only believed
+/// once two agree on it.
 #[test]
 fn matched_keypoints_prove_the_place_whatever_the_latents_say() {
     let adapter = Arc::new(calibrated().0);

@@ -67,8 +67,8 @@ fn length_m(poses: &[Pose]) -> f64 {
         .sum()
 }
 
-/// Oracle: the true path. Depths are known in the first ten frames, as in a mapped part of a room; the
-/// drift afterwards is below 1 % of the path, with a noise of half a pixel.
+/// Oracle: the true path. Depths are known in the first ten frames, as in a mapped part of a room;
+/// the drift afterwards is below 1 % of the path, with a noise of half a pixel.
 #[test]
 fn the_path_goes_on_where_the_map_ends() {
     let mut world = World::new();
@@ -151,8 +151,8 @@ fn a_turn_in_place_is_no_way() {
     assert!(off.translation.vector.norm() < 0.03, "{off}");
 }
 
-/// Oracle: the contract. Blank images give no motion; afterwards the camera is found again in the same
-/// local map, or, after many of them, begins a new one.
+/// Oracle: the contract. Blank images give no motion; afterwards the camera is found again in the
+/// same local map, or, after many of them, begins a new one.
 #[test]
 fn a_covered_camera_goes_on() {
     let truth: Vec<Pose> = camera_path(150).into_iter().take(60).collect();

@@ -128,7 +128,8 @@ impl AuthLayer {
             Some((_, Need::Nothing)) => return Ok(None),
             Some((_, Need::Verb(verb))) => Some(*verb),
             // A path without a row needs no verb; every service that is registered must have a row.
-            // On an unknown path, authenticated callers get "unimplemented", others "unauthenticated".
+            // On an unknown path, authenticated callers get "unimplemented", others
+            // "unauthenticated".
             None => None,
         };
 

@@ -56,9 +56,9 @@ impl Changes {
         }
     }
 
-    /// Makes a change at most once per request id. Waits for its turn; returns the stored response if
-    /// this change was made already; otherwise makes the change, reloads the store, and builds and
-    /// stores the response. An admitted change is completed even if the caller disconnects.
+    /// Makes a change at most once per request id. Waits for its turn; returns the stored response
+    /// if this change was made already; otherwise makes the change, reloads the store, and builds
+    /// and stores the response. An admitted change is completed even if the caller disconnects.
     ///
     /// # Errors
     /// The errors of the change; [`Error::Invalid`] if the request id belongs to a different

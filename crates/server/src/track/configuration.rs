@@ -321,8 +321,8 @@ pub fn unnamed(pose: pb::Pose) -> Result<Pose, Error> {
 /// A covariance of velocities, row by row; `None` if it is empty.
 ///
 /// # Errors
-/// [`Error::Invalid`] for another number of values, and for a matrix that is not symmetric and positive
-/// semidefinite, or zero.
+/// [`Error::Invalid`] for another number of values, and for a matrix that is not symmetric and
+/// positive semidefinite, or zero.
 fn velocity_noise(given: &[f64]) -> Result<Option<Matrix6<f64>>, Error> {
     let invalid = |problem: String| Error::invalid("velocity_covariance", problem);
     if given.is_empty() {

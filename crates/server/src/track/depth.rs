@@ -45,7 +45,8 @@ impl DepthImage {
         })
     }
 
-    /// The depths of the keypoints of the image; those of unknown or of uncertain depth are left out.
+    /// The depths of the keypoints of the image; those of unknown or of uncertain depth are left
+    /// out.
     ///
     /// # Errors
     /// [`Error::Invalid`] on `png` if the image has another aspect ratio.
@@ -126,7 +127,8 @@ mod tests {
 
     const BOUNDS: Bounds = Bounds::LOCAL;
 
-    /// By hand: 4 × 2 pixels; the keypoint at (0.3, 0.6) lies in column 1 of row 1, whose value is 150.
+    /// By hand: 4 × 2 pixels; the keypoint at (0.3, 0.6) lies in column 1 of row 1, whose value is
+    /// 150.
     #[test]
     fn a_keypoint_has_the_depth_of_its_pixel() {
         let file = png(4, 2, &[0, 10, 20, 30, 40, 150, 60, 65535]);

@@ -85,12 +85,12 @@ impl Inertial {
         })
     }
 
-    /// Adds the samples of a frame. Those that are not later than the newest known one are there already,
-    /// and are left out.
+    /// Adds the samples of a frame. Those that are not later than the newest known one are there
+    /// already, and are left out.
     ///
     /// # Errors
-    /// [`Error::Invalid`] on a sample that is not finite, too large or not later than the one before it
-    /// in the frame, and for too many. No sample is then added.
+    /// [`Error::Invalid`] on a sample that is not finite, too large or not later than the one
+    /// before it in the frame, and for too many. No sample is then added.
     pub fn add(&mut self, given: &[pb::InertialSample]) -> Result<(), Error> {
         if given.len() > MOST_SAMPLES {
             let problem = format!("must be at most {MOST_SAMPLES}, not {}", given.len());

@@ -328,8 +328,8 @@ fn message_of(next: Result<pb::TrackRequest, Status>) -> Result<Message, Status>
 }
 
 /// Replaces the waiting frame `before` by the newer frame `came`, which then counts it as
-/// superseded, and takes its inertial samples. Returns `before` if it needs its own answer: if either
-/// message is not a frame, or `came` is not later in both time and sequence.
+/// superseded, and takes its inertial samples. Returns `before` if it needs its own answer: if
+/// either message is not a frame, or `came` is not later in both time and sequence.
 fn overtake(mut before: Incoming, came: &mut Incoming) -> Option<Incoming> {
     let (Ok(Message::Frame(old)), Ok(Message::Frame(new))) =
         (&mut before.message, &mut came.message)

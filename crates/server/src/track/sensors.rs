@@ -122,7 +122,8 @@ impl Sensors {
         self.gravity_in_map
     }
 
-    /// The camera of this name, where the stream's own camera has this velocity, with its covariance.
+    /// The camera of this name, where the stream's own camera has this velocity, with its
+    /// covariance.
     ///
     /// # Errors
     /// [`Error::Invalid`] if there is none.
@@ -258,9 +259,9 @@ mod tests {
         Sensors::of(&config, &StreamFrames::of(&config).unwrap())
     }
 
-    /// By hand: at 2 m/s along x and two and a half turns per second about z, 0.1 s later the own camera has
-    /// turned by 90° on an arc of radius 0.4/π m. A camera 0.2 m ahead of it is then at the same x and y,
-    /// 0.2 m along z.
+    /// By hand: at 2 m/s along x and two and a half turns per second about z, 0.1 s later the own
+    /// camera has turned by 90° on an arc of radius 0.4/π m. A camera 0.2 m ahead of it is then at
+    /// the same x and y, 0.2 m along z.
     #[test]
     fn a_later_view_is_moved_by_the_velocity() {
         let velocity = Twist {

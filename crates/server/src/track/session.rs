@@ -94,7 +94,8 @@ impl Session {
                 other => other,
             })?;
 
-        // The state's poses are valid only in the same rooms, and its room only under the same adapter.
+        // The state's poses are valid only in the same rooms, and its room only under the same
+        // adapter.
         let state = sealed.opened_in(&session.rooms).ok_or_else(|| {
             let problem = "this server has another room or adapter than the token; start anew";
             Error::Precondition(format!("{field}: {problem}"))
@@ -358,14 +359,14 @@ impl Session {
         ))
     }
 
-    /// The room in which views are compared; `None` for all rooms. A stream that is LOST may have been
-    /// carried to another room.
+    /// The room in which views are compared; `None` for all rooms. A stream that is LOST may have
+    /// been carried to another room.
     fn room_to_match(&self) -> Option<usize> {
         self.engine.room().filter(|_| !self.is_lost)
     }
 
-    /// Reads the keypoints of the stream's own image, with the depth image of its frame. `motion` is that
-    /// since the last frame, if a sensor measures it.
+    /// Reads the keypoints of the stream's own image, with the depth image of its frame. `motion`
+    /// is that since the last frame, if a sensor measures it.
     fn read(
         &mut self,
         image: &ImageKeypoints,
@@ -425,8 +426,8 @@ impl Session {
         })
     }
 
-    /// Adds the inertial samples of a frame; returns the middle of its exposure, if the stream has an
-    /// inertial sensor.
+    /// Adds the inertial samples of a frame; returns the middle of its exposure, if the stream has
+    /// an inertial sensor.
     fn add_inertial(&mut self, frame: &pb::TrackFrame) -> Result<Option<i64>, Error> {
         match &mut self.inertial {
             Some(inertial) => {
@@ -536,8 +537,8 @@ impl Session {
         })
     }
 
-    /// The observation of a frame by the most similar mapped frames, and by the keypoints of an image.
-    /// Also returns the camera that the keypoints contradict.
+    /// The observation of a frame by the most similar mapped frames, and by the keypoints of an
+    /// image. Also returns the camera that the keypoints contradict.
     fn retrieved(
         &mut self,
         frame: pb::TrackFrame,
@@ -626,8 +627,8 @@ impl Session {
     }
 
     fn answer(&self, answer: pb::track_response::Answer) -> pb::TrackResponse {
-        // The token carries pose, velocity and times, so that the stream can resume after a restart or
-        // on another server.
+        // The token carries pose, velocity and times, so that the stream can resume after a restart
+        // or on another server.
         let sealed = Sealed::new(&self.config, self.engine.state.saved(), &self.rooms);
         pb::TrackResponse {
             answer: Some(answer),

@@ -9,7 +9,7 @@ use sha2::{Digest, Sha256};
 use super::super::Error;
 
 /// First bytes of a token: file type and layout version.
-const MAGIC: &[u8; 4] = b"S3TC";
+const MAGIC: &[u8; 4] = b"S3TD";
 /// Length of the key id, bytes.
 const KEY_ID: usize = 8;
 /// Length of the HMAC-SHA-256 seal, bytes.

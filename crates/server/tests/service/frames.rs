@@ -117,8 +117,8 @@ async fn frames_come_page_by_page() {
     assert!(beyond.frames.is_empty() && beyond.next_page_token.is_empty());
 }
 
-/// The room `synthetic` again, as `pictured`, with images below a folder: of every three frames one is
-/// red, one green, and one has no file.
+/// The room `synthetic` again, as `pictured`, with images below a folder: of every three frames one
+/// is red, one green, and one has no file.
 fn pictured_room(folder: &std::path::Path) -> Room {
     for (name, colour) in [("red.png", [250, 0, 0]), ("green.png", [0, 250, 0])] {
         let picture = RgbImage {

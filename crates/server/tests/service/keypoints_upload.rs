@@ -126,8 +126,8 @@ async fn uploaded_keypoints_are_stored_as_those_from_the_disk() {
     assert_eq!(stored(&store, "there").await.map.frames, here.map.frames);
 }
 
-/// Oracle: the definition of the keypoints of a frame: those of known frames stay; added frames have
-/// those that were sent with them, or none.
+/// Oracle: the definition of the keypoints of a frame: those of known frames stay; added frames
+/// have those that were sent with them, or none.
 #[tokio::test]
 async fn frames_that_extend_a_room_have_the_keypoints_that_are_sent() {
     let (server, store) = start_writable().await;

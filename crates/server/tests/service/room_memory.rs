@@ -1,4 +1,5 @@
-//! Rooms are loaded when they are asked for and dropped when memory is short; answers stay the same.
+//! Rooms are loaded when they are asked for and dropped when memory is short; answers stay the
+//! same.
 
 use std::sync::Arc;
 

@@ -54,8 +54,8 @@ fn pose(given: Option<&pb::Pose>) -> Pose {
 }
 
 /// Oracle: the definitions. Gravity as the level camera of the hall measures it, in its own axes or
-/// in those of the base, contradicts nothing. What a camera measures that is rolled by ten degrees, or
-/// one whose axes are not what was said, contradicts what is surely seen, and that is said.
+/// in those of the base, contradicts nothing. What a camera measures that is rolled by ten degrees,
+/// or one whose axes are not what was said, contradicts what is surely seen, and that is said.
 #[tokio::test]
 async fn gravity_that_contradicts_the_views_is_said() {
     let server = start_followed(Default::default()).await;
@@ -200,8 +200,8 @@ async fn a_frozen_second_camera_is_not_believed() {
         other_cameras: vec![second_camera(&Pose::identity())],
         ..config()
     };
-    // The own views are off the map's a little, so that the second camera's, which is one of the map's,
-    // leads, until it shows the same again.
+    // The own views are off the map's a little, so that the second camera's, which is one of the
+    // map's, leads, until it shows the same again.
     let own = |row: usize| {
         let view = served("hall")
             .1
@@ -391,8 +391,8 @@ async fn measurements_that_are_none_are_refused() {
     }
 }
 
-/// What a sensor in these axes measures between a row and the one before, five samples at constant rates.
-/// The timestamps are 20 ms early.
+/// What a sensor in these axes measures between a row and the one before, five samples at constant
+/// rates. The timestamps are 20 ms early.
 fn gyroscope(
     row: usize,
     base_from_camera: &Pose,
@@ -414,8 +414,8 @@ fn gyroscope(
         .collect()
 }
 
-/// Oracle: the turns of the camera, measured by a sensor that is mounted in other axes on the base and
-/// whose clock is 20 ms slow. The views of the second half show nothing known.
+/// Oracle: the turns of the camera, measured by a sensor that is mounted in other axes on the base
+/// and whose clock is 20 ms slow. The views of the second half show nothing known.
 #[tokio::test]
 async fn a_gyroscope_turns_the_pose_where_nothing_is_seen() {
     let server = start_followed(Default::default()).await;
@@ -544,8 +544,8 @@ async fn inertial_samples_that_are_none_are_refused() {
     assert!(error.message().contains(says), "{}", error.message());
 }
 
-/// Oracle: the contract: a covariance of velocities has 36 numbers, is symmetric and positive semidefinite, and
-/// not zero.
+/// Oracle: the contract: a covariance of velocities has 36 numbers, is symmetric and positive
+/// semidefinite, and not zero.
 #[tokio::test]
 async fn a_covariance_of_velocities_is_checked() {
     let server = start_followed(Default::default()).await;

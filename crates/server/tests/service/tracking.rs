@@ -195,9 +195,9 @@ async fn a_camera_in_a_mapped_room_is_followed() {
     assert!(begins_at.norm() < 1e-12 && first.body_velocity.is_none());
 }
 
-/// Oracle: the contract. A token holds the map pose to the bit: two servers with the same content and
-/// key answer the same from it, bit by bit, tokens and all. The answers are nearly those of the stream
-/// that was never cut. The odometry begins anew.
+/// Oracle: the contract. A token holds the map pose to the bit: two servers with the same content
+/// and key answer the same from it, bit by bit, tokens and all. The answers are nearly those of the
+/// stream that was never cut. The odometry begins anew.
 #[tokio::test]
 async fn a_stream_goes_on_at_another_server() {
     let one = server(KEY).await;
@@ -390,8 +390,8 @@ async fn late_and_duplicate_frames_are_refused_and_leave_no_trace() {
     }
 }
 
-/// Oracle: the contract: views of another place are not TRACKING after 0.1 s. The pose is continued,
-/// and is less certain than before.
+/// Oracle: the contract: views of another place are not TRACKING after 0.1 s. The pose is
+/// continued, and is less certain than before.
 #[tokio::test]
 async fn a_camera_in_another_place_is_not_tracked() {
     let server = server(KEY).await;

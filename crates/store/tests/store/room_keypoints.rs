@@ -71,8 +71,8 @@ fn features(name: &str, rows: std::ops::Range<usize>) -> Features {
     set(name, 1.0).select(&rows.collect::<Vec<_>>())
 }
 
-/// Oracle: what was published, within half a step of each number: 1/65535 of the image, 16/65535 of an
-/// inverse unit, 0.001 of a deviation. Everything else is exact.
+/// Oracle: what was published, within half a step of each number: 1/65535 of the image, 16/65535 of
+/// an inverse unit, 0.001 of a deviation. Everything else is exact.
 #[tokio::test]
 async fn keypoints_come_back_within_half_a_step() {
     let sent = keypoints(FRAMES, 20);
@@ -360,8 +360,8 @@ async fn known_frames_without_keypoints_get_those_that_are_sent_again() {
     }
 }
 
-/// Oracle: the promise that nothing is lost: keypoints that do not belong to the room are refused with
-/// what to change, and nothing is published.
+/// Oracle: the promise that nothing is lost: keypoints that do not belong to the room are refused
+/// with what to change, and nothing is published.
 #[tokio::test]
 async fn added_keypoints_of_another_kind_are_refused() {
     let known = keypoints(260, 5);
@@ -427,8 +427,9 @@ async fn a_damaged_file_of_keypoints_is_found() {
     assert!(matches!(refused, Error::Damaged { .. }), "{refused}");
 }
 
-/// Oracle: the contract of published parameters: they come back in the next revision, with everything else
-/// as it was, stay with other features and more frames, and are refused if no filter can have them.
+/// Oracle: the contract of published parameters: they come back in the next revision, with
+/// everything else as it was, stay with other features and more frames, and are refused if no
+/// filter can have them.
 #[tokio::test]
 async fn parameters_of_tracking_are_published_with_a_room() {
     let sent = keypoints(FRAMES, 5);
@@ -482,8 +483,9 @@ async fn parameters_of_tracking_are_published_with_a_room() {
     assert!(!manifests.join("000005.json").exists());
 }
 
-/// Oracle: composition by hand. A crop keeps what belongs to the frames; a similarity moves cameras and the
-/// points of the map alike; joined rooms have the frames of both, in sequences of their own.
+/// Oracle: composition by hand. A crop keeps what belongs to the frames; a similarity moves cameras
+/// and the points of the map alike; joined rooms have the frames of both, in sequences of their
+/// own.
 #[tokio::test]
 async fn rooms_are_cropped_moved_and_merged() {
     let sent = keypoints(FRAMES, 5);

@@ -531,8 +531,8 @@ async fn bad_visitors_are_told_what_to_change() {
     ));
 }
 
-/// Oracle: the contract of the feature `cloud`: a bucket is opened without a request, or the error names
-/// the feature.
+/// Oracle: the contract of the feature `cloud`: a bucket is opened without a request, or the error
+/// names the feature.
 #[test]
 fn a_bucket_is_opened_or_the_error_names_the_feature() {
     let opened = Store::open("s3://bucket/prefix");

@@ -178,8 +178,8 @@ pub(super) fn plan(room: &Room, hold_out: HoldOut, disturbance: Disturbance) -> 
     planned
 }
 
-/// Scores the replays of planned streams. `nearest` returns the pose of the mapped frame that is most
-/// similar to a view, by its row among the tracked frames.
+/// Scores the replays of planned streams. `nearest` returns the pose of the mapped frame that is
+/// most similar to a view, by its row among the tracked frames.
 pub(super) fn scored(
     room: &Room,
     disturbance: Disturbance,
