@@ -335,6 +335,7 @@ async fn images([streams, hz, seconds]: [f64; 3], [store, room, folder, model]: 
         models: vec![model.to_owned()],
         runtime: runtime.clone(),
         bounds: Bounds::LOCAL,
+        request_pixels: ImageEncoders::REQUEST_PIXELS,
     };
 
     let store = Store::open(store).unwrap();

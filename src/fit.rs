@@ -4,8 +4,9 @@ use clap::Args;
 use indicatif::ProgressBar;
 use serde_json::json;
 
+use seese3_core::cancel::Cancellation;
 use seese3_core::training::RoomData;
-use seese3_robot::fitting::{FITTING_EPOCHS, Fitted, PartRule};
+use seese3_robot::fitting::{FITTING_EPOCHS, FitRun, Fitted, PartRule};
 
 use super::output::{say, say_published};
 use super::progress::bar;
@@ -47,7 +48,10 @@ impl Fit {
         let refit = Refit::prepare(&store, request).await?;
 
         let progress = fitting_bar(true);
-        let fitted = refit.fit(&|_| progress.inc(1))?;
+        let fitted = refit.fit(FitRun {
+            progress: &|_| progress.inc(1),
+            cancel: &Cancellation::new(),
+        })?;
         progress.finish_and_clear();
 
         let published = refit.publish(&store, &fitted).await?;

@@ -97,6 +97,9 @@ pub struct Serve {
     /// Maximum size of an image, 1 to 1000000000 pixels after decoding
     #[arg(long, env = "SEESE3_MAX_IMAGE_PIXELS", default_value_t = 16_000_000, value_parser = clap::value_parser!(u64).range(1..=1_000_000_000))]
     max_image_pixels: u64,
+    /// Maximum number of pixels of all images of one request, 1 to 1000000000000
+    #[arg(long, env = "SEESE3_MAX_REQUEST_PIXELS", default_value_t = ImageEncoders::REQUEST_PIXELS, value_parser = clap::value_parser!(u64).range(1..=1_000_000_000_000))]
+    max_request_pixels: u64,
     /// Maximum number of steps in one navigation; requests beyond it are refused
     #[arg(long, env = "SEESE3_MAX_STEPS", default_value_t = Limits::default().steps, value_parser = clap::value_parser!(u32).range(1..))]
     max_steps: u32,
@@ -359,6 +362,7 @@ impl Serve {
                         bytes: self.max_message_bytes as u64,
                         pixels: self.max_image_pixels,
                     },
+                    request_pixels: self.max_request_pixels,
                 }
             }),
             limits: Limits {

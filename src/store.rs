@@ -9,7 +9,9 @@ use serde_json::{Value, json};
 use super::output::say;
 use super::progress::spinner;
 use super::store_option::StoreAndJson;
-use seese3_store::{Choice, Contents, Kind, ResourceName, RevisionContents};
+use seese3_store::{
+    Choice, Contents, GRACE, GarbagePolicy, Kind, Publishers, ResourceName, RevisionContents,
+};
 
 #[derive(Debug, Args)]
 pub struct StoreCommand {
@@ -73,10 +75,14 @@ struct Remove {
 
 #[derive(Debug, Args)]
 struct CollectGarbage {
-    /// Keep files that were written in the last SECONDS: they may belong to a publication in
-    /// progress
-    #[arg(long, value_name = "SECONDS", default_value_t = 3_600)]
+    /// Keep files that were written in the last SECONDS by the store's own clock, at least 3600:
+    /// they may belong to a publication in progress
+    #[arg(long, value_name = "SECONDS", default_value_t = GRACE.as_secs())]
     older_than: u64,
+    /// State that no other program publishes to the store meanwhile: --older-than may then be less
+    /// than 3600
+    #[arg(long)]
+    no_concurrent_publishers: bool,
     /// Only print what would be removed
     #[arg(long)]
     dry_run: bool,
@@ -215,11 +221,17 @@ impl Remove {
 impl CollectGarbage {
     async fn run(self) -> anyhow::Result<()> {
         let store = self.common.open()?;
-        let older_than = Duration::from_secs(self.older_than);
+        let policy = GarbagePolicy {
+            older_than: Duration::from_secs(self.older_than),
+            publishers: match self.no_concurrent_publishers {
+                true => Publishers::None,
+                false => Publishers::Concurrent,
+            },
+        };
         let (garbage, word) = if self.dry_run {
-            (store.find_garbage(older_than).await?, "would free")
+            (store.find_garbage(policy).await?, "would free")
         } else {
-            (store.collect_garbage(older_than).await?, "freed")
+            (store.collect_garbage(policy).await?, "freed")
         };
 
         self.common.json.write(&json!({

@@ -39,6 +39,16 @@ pub enum Error {
         frame: usize,
         image: String,
     },
+    #[error(
+        "room '{room}', frame {frame}: the {what} has {length} bytes, over the limit of {limit}"
+    )]
+    TextTooLong {
+        room: RoomId,
+        frame: usize,
+        what: &'static str,
+        length: usize,
+        limit: usize,
+    },
     #[error("room '{room}' has no frame {frame}; it has frames 0 to {}", frame_count - 1)]
     UnknownFrame {
         room: RoomId,
@@ -52,6 +62,12 @@ pub const MAX_DISTANCE_M: f64 = 1e6;
 
 /// Maximum number of frames in a room.
 pub const MAX_FRAMES: usize = 10_000_000;
+
+/// Maximum length of a frame's name, bytes. Answers repeat it for each retrieved frame.
+pub const MAX_FRAME_NAME: usize = 1_000;
+
+/// Maximum length of the path of an image, bytes; the limit of Linux.
+pub const MAX_IMAGE_PATH: usize = 4_096;
 
 /// The name of a room, which is also the name of its folder in the store.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -242,6 +258,28 @@ impl Timeline {
     }
 }
 
+/// The length of the longest text, bytes.
+///
+/// # Errors
+/// [`Error::TextTooLong`] for the first text over `limit`.
+fn checked_lengths(
+    room: &RoomId,
+    what: &'static str,
+    texts: &[String],
+    limit: usize,
+) -> Result<usize, Error> {
+    if let Some(frame) = texts.iter().position(|text| text.len() > limit) {
+        return Err(Error::TextTooLong {
+            room: room.clone(),
+            frame,
+            what,
+            length: texts[frame].len(),
+            limit,
+        });
+    }
+    Ok(texts.iter().map(String::len).max().unwrap_or(0))
+}
+
 /// A room with validated frames. Immutable.
 #[derive(Debug, Clone)]
 pub struct Room {
@@ -249,6 +287,7 @@ pub struct Room {
     frames: Frames,
     timeline: Timeline,
     provenance: Provenance,
+    longest_frame_name: usize,
 }
 
 impl Room {
@@ -258,7 +297,8 @@ impl Room {
     /// Checked in this order: [`Error::Empty`] if there are no poses, [`Error::TooManyFrames`] over
     /// [`MAX_FRAMES`], [`Error::Count`] if a column is not as long as the poses,
     /// [`Error::PoseNotFinite`] if a pose is not finite or over [`MAX_DISTANCE_M`] from the origin,
-    /// [`Error::ImagePath`] if the path of an image could leave its folder.
+    /// [`Error::ImagePath`] if the path of an image could leave its folder, [`Error::TextTooLong`]
+    /// if a name is over [`MAX_FRAME_NAME`] or a path over [`MAX_IMAGE_PATH`].
     pub fn new(id: RoomId, frames: Frames, provenance: Provenance) -> Result<Self, Error> {
         let frame_count = frames.poses.len();
         if frame_count == 0 {
@@ -298,6 +338,9 @@ impl Room {
             });
         }
 
+        let longest_frame_name = checked_lengths(&id, "name", &frames.names, MAX_FRAME_NAME)?;
+        checked_lengths(&id, "path of the image", &frames.images, MAX_IMAGE_PATH)?;
+
         // The timeline is a copy of two columns, so that splits do not need the poses and image
         // paths.
         let sequences = frames.sequences.clone();
@@ -313,6 +356,7 @@ impl Room {
             frames,
             timeline,
             provenance,
+            longest_frame_name,
         })
     }
 
@@ -364,6 +408,11 @@ impl Room {
     /// The recording's own frame names; empty if it has none.
     pub fn frame_names(&self) -> &[String] {
         &self.frames.names
+    }
+
+    /// Length of the longest frame name, bytes.
+    pub fn longest_frame_name(&self) -> usize {
+        self.longest_frame_name
     }
 
     /// The recording's own frame numbers; empty if it has none.

@@ -71,6 +71,46 @@ pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Erro
     decoded.map_err(|problem| bad_image(name, &problem))
 }
 
+/// What decoding an image will need, from its header alone.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct DecodingCost {
+    /// Number of pixels.
+    pub pixels: u64,
+    /// Peak memory of decoding to 8-bit RGB, bytes.
+    pub bytes: u64,
+}
+
+/// The cost of decoding an image. `None` if it has no JPEG or PNG header: [`decode`] refuses it.
+pub fn decoding_cost(bytes: &[u8]) -> Option<DecodingCost> {
+    /// Bytes of a pixel in 8-bit RGB.
+    const RGB: u64 = 3;
+    /// Bytes of a pixel's coefficients in a progressive JPEG: three channels of 16 bits.
+    const COEFFICIENTS: u64 = 6;
+
+    match image::guess_format(bytes).ok()? {
+        ImageFormat::Jpeg => {
+            let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), jpeg_options());
+            decoder.decode_headers().ok()?;
+            let (width, height) = decoder.dimensions()?;
+            let pixels = width as u64 * height as u64;
+            Some(DecodingCost {
+                pixels,
+                bytes: pixels * (RGB + COEFFICIENTS),
+            })
+        }
+        ImageFormat::Png => {
+            let decoder = png_reader(bytes, HEADER_ALLOC).into_decoder().ok()?;
+            let (width, height) = decoder.dimensions();
+            let pixels = u64::from(width) * u64::from(height);
+            Some(DecodingCost {
+                pixels,
+                bytes: decoder.total_bytes().saturating_add(pixels * RGB),
+            })
+        }
+        _ => None,
+    }
+}
+
 /// 16-bit gray values, row by row.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct GrayImage16 {
@@ -129,29 +169,32 @@ fn check_bytes(bytes: &[u8], bounds: Bounds) -> Result<(), String> {
 fn decode_png(bytes: &[u8], bounds: Bounds) -> Result<(DynamicImage, Orientation), String> {
     check_bytes(bytes, bounds)?;
     let problem = |error: image::ImageError| error.to_string();
-    let read = |most: u64| {
-        let mut reader = ImageReader::new(Cursor::new(bytes));
-        reader.set_format(ImageFormat::Png);
-        let mut limits = Limits::default();
-        limits.max_alloc = Some(most);
-
-        reader.limits(limits);
-        reader
-    };
-
     // The header is read alone first, so that an image over the limits is refused before memory is
     // allocated for its pixels.
-    let (width, height) = read(HEADER_ALLOC).into_dimensions().map_err(problem)?;
+    let (width, height) = png_reader(bytes, HEADER_ALLOC)
+        .into_dimensions()
+        .map_err(problem)?;
     check_size(width as usize, height as usize, bounds)?;
 
     // A pixel has at most four channels of 16 bits, 8 bytes; the decoder may use as much again.
     let most = (u64::from(width) * u64::from(height))
         .saturating_mul(16)
         .saturating_add(HEADER_ALLOC);
-    let mut decoder = read(most).into_decoder().map_err(problem)?;
+    let mut decoder = png_reader(bytes, most).into_decoder().map_err(problem)?;
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     let decoded = DynamicImage::from_decoder(decoder).map_err(problem)?;
     Ok((decoded, orientation))
+}
+
+/// A reader of a PNG that allocates at most `most` bytes.
+fn png_reader(bytes: &[u8], most: u64) -> ImageReader<Cursor<&[u8]>> {
+    let mut reader = ImageReader::new(Cursor::new(bytes));
+    reader.set_format(ImageFormat::Png);
+    let mut limits = Limits::default();
+    limits.max_alloc = Some(most);
+
+    reader.limits(limits);
+    reader
 }
 
 /// Applies an EXIF orientation to an image.
@@ -191,14 +234,7 @@ fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
         return Err("has no end-of-image marker: the file is truncated".to_owned());
     }
 
-    // The decoder's own limits on size are raised to the largest that the format allows, so that
-    // `check_size` alone decides.
-    let options = DecoderOptions::default()
-        .set_strict_mode(true)
-        .set_max_width(usize::from(u16::MAX))
-        .set_max_height(usize::from(u16::MAX))
-        .jpeg_set_out_colorspace(ColorSpace::RGB);
-    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
+    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), jpeg_options());
     decoder
         .decode_headers()
         .map_err(|error| error.to_string())?;
@@ -213,6 +249,16 @@ fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
         .exif()
         .and_then(|exif| Orientation::from_exif_chunk(exif));
     Ok(upright(image, exif.unwrap_or(Orientation::NoTransforms)))
+}
+
+/// The decoder's own limits on size are raised to the largest that the format allows, so that
+/// `check_size` alone decides.
+fn jpeg_options() -> DecoderOptions {
+    DecoderOptions::default()
+        .set_strict_mode(true)
+        .set_max_width(usize::from(u16::MAX))
+        .set_max_height(usize::from(u16::MAX))
+        .jpeg_set_out_colorspace(ColorSpace::RGB)
 }
 
 /// The bytes after the header of a JPEG; `None` if the header is incomplete. An end-of-image marker
@@ -334,12 +380,14 @@ fn open_part(root: &Path, image: &str) -> Result<ImagePart, Error> {
         ))
     });
 
-    let path = root.join(part.map_or(image, |(file, _, _)| file));
+    let name = part.map_or(image, |(file, _, _)| file);
+    let path = root.join(name);
     let io = |cause| Error::Io {
         file: path.clone(),
         cause,
     };
-    let mut file = File::open(&path).map_err(io)?;
+    let resolved = seese3_files::below(root, Path::new(name)).map_err(io)?;
+    let mut file = seese3_files::open(&resolved).map_err(io)?;
     let mut length = file.metadata().map_err(io)?.len();
 
     if let Some((_, offset, part_length)) = part {

@@ -41,7 +41,10 @@ mod tract;
 mod backbone;
 
 pub use builtin::{BUILTIN_DIM, builtin_source, encode_builtin};
-pub use decode::{Bounds, GrayImage16, decode, decode_gray16, encode_png, image_size, read_image};
+pub use decode::{
+    Bounds, DecodingCost, GrayImage16, decode, decode_gray16, decoding_cost, encode_png,
+    image_size, read_image,
+};
 pub use journal::{EncodedFrame, Journal, NumberedFrames};
 pub use keypoints::KeypointOutputs;
 pub use pooling::Pooling;

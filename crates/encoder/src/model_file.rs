@@ -6,7 +6,6 @@
 
 use seese3_core::Cause;
 use std::collections::{BTreeSet, HashSet};
-use std::fs::File;
 use std::path::{Component, Path};
 
 use prost::Message;
@@ -233,8 +232,11 @@ pub(super) fn identity(file: &Path) -> Result<String, Error> {
     id_of(file, &bytes, &graph)
 }
 
+/// Maximum size of a model file, bytes: the limit of a protocol buffer.
+const MAX_MODEL_BYTES: u64 = 2 << 30;
+
 fn read_graph(file: &Path) -> Result<(Vec<u8>, GraphProto), Error> {
-    let bytes = std::fs::read(file).map_err(|cause| Error::Io {
+    let bytes = seese3_files::read(file, MAX_MODEL_BYTES).map_err(|cause| Error::Io {
         file: file.to_owned(),
         cause,
     })?;
@@ -293,7 +295,7 @@ fn id_of(file: &Path, bytes: &[u8], graph: &GraphProto) -> Result<String, Error>
 
         let weights = file.parent().unwrap_or(Path::new("")).join(name);
         let mut weights =
-            File::open(&weights).map_err(|cause| {
+            seese3_files::open(&weights).map_err(|cause| {
                 wrong(format!(
                 "keeps weights in {}, which cannot be read: {cause}; copy it beside the model",
                 weights.display()

@@ -9,6 +9,9 @@ use serde::Deserialize;
 
 use super::{Error, Filter, Preparation, Resize};
 
+/// Maximum size of the file, bytes.
+const MAX_CONFIG_BYTES: u64 = 16 << 20;
+
 /// The fields that determine the preparation. Those of the two libraries overlap only in
 /// `crop_pct`.
 #[derive(Deserialize)]
@@ -79,7 +82,7 @@ enum Size {
 /// [`Error::Io`] if the file cannot be read, [`Error::Model`] if it is not such a file or requests
 /// a step that [`Preparation`] does not support.
 pub fn read_preprocess_file(file: &Path) -> Result<Preparation, Error> {
-    let text = std::fs::read(file).map_err(|cause| Error::Io {
+    let text = seese3_files::read(file, MAX_CONFIG_BYTES).map_err(|cause| Error::Io {
         file: file.to_owned(),
         cause,
     })?;

@@ -10,7 +10,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::pin::Pin;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
@@ -33,16 +33,22 @@ use super::tls::Tls;
 const PREFACE: usize = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".len();
 /// Time limit for the TLS handshake and the preface.
 const OPENING: Duration = Duration::from_secs(10);
+/// Maximum number of concurrent health calls of a connection. They need no credentials.
+const MOST_HEALTH_CALLS: usize = 8;
 /// Pause after `accept` failed, for instance because the process reached its limit of open files.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(200);
 
 /// The client side of a connection.
 #[derive(Debug, Clone)]
 pub struct Peer {
+    /// Number of the connection, unique in this process.
+    pub id: u64,
     /// The remote address.
     pub address: SocketAddr,
     /// SHA-256 of the verified client certificate, if the server requires one.
     pub certificate: Option<[u8; 32]>,
+    /// Places of the connection's health calls.
+    health: Arc<Semaphore>,
     closing: Arc<Closing>,
 }
 
@@ -55,6 +61,11 @@ struct Closing {
 }
 
 impl Peer {
+    /// A place for one more health call of the connection; `None` at the limit.
+    pub fn health_place(&self) -> Option<OwnedSemaphorePermit> {
+        self.health.clone().try_acquire_owned().ok()
+    }
+
     /// Closes the connection and all its streams. Returns true on the first call only.
     pub fn close(&self) -> bool {
         self.closing.now.notify_one();
@@ -82,6 +93,7 @@ enum Transport {
 #[derive(Clone)]
 struct Opener {
     places: Arc<Semaphore>,
+    last_id: Arc<AtomicU64>,
     tls: Option<Arc<Tls>>,
     metrics: Metrics,
 }
@@ -96,6 +108,7 @@ pub fn incoming(
 ) -> impl Stream<Item = io::Result<Connection>> {
     let opener = Opener {
         places: Arc::new(Semaphore::new(most)),
+        last_id: Arc::default(),
         tls,
         metrics,
     };
@@ -194,7 +207,9 @@ impl Opener {
             preface: io::Cursor::new(preface),
             closed: Box::pin(closing.now.clone().notified_owned()),
             peer: Peer {
+                id: self.last_id.fetch_add(1, Ordering::Relaxed),
                 address,
+                health: Arc::new(Semaphore::new(MOST_HEALTH_CALLS)),
                 certificate,
                 closing,
             },

@@ -3,8 +3,9 @@
 
 use tonic::{Request, Response, Status};
 
+use super::cost::lane;
 use super::embedding::RequestAdapter;
-use super::workers::Lane;
+use super::workers::{image_count, images_of};
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
@@ -18,8 +19,12 @@ impl Handlers {
         &self,
         request: Request<pb::EncodeRequest>,
     ) -> Result<Response<pb::EncodeResponse>, Status> {
-        self.unary(request, |request| Lane::of(&request.views), answer)
-            .await
+        self.unary(
+            request,
+            |_, request| lane(image_count(&request.views), 0.0),
+            answer,
+        )
+        .await
     }
 }
 
@@ -44,6 +49,10 @@ fn answer(
 
     let chosen = RequestAdapter::of(snapshot, &room, &adapter)?;
     let embedder = chosen.embedder(snapshot);
+    if image_count(&views) > 0 {
+        let encoder = snapshot.image_encoder(&chosen.stored)?;
+        encoder.check_pixels("views", images_of(&views))?;
+    }
     let mut encoded = Vec::with_capacity(views.len());
     for (position, view) in views.into_iter().enumerate() {
         cancel.check()?;

@@ -2,7 +2,6 @@
 
 use std::pin::Pin;
 use std::sync::Arc;
-use std::time::Duration;
 
 use tokio::sync::mpsc;
 use tokio_stream::{Stream, wrappers::ReceiverStream};
@@ -11,7 +10,7 @@ use tracing::Instrument;
 
 use super::convert;
 use super::snapshot::ServedNavigator;
-use super::workers::Lane;
+use super::workers::{CallContext, Lane};
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::evaluation_service_server::EvaluationService;
@@ -31,12 +30,12 @@ impl EvaluationService for Handlers {
         request: Request<pb::EvaluateRequest>,
     ) -> Result<Response<Self::EvaluateStream>, Status> {
         let snapshot = self.snapshot(&request)?;
-        let budget = self.workers.budget(request.metadata());
+        let context = self.workers.context(&request);
         let most_steps = self.config.limits.steps;
         let request = request.into_inner();
         let (served, protocol) = self
             .workers
-            .run(Lane::Short, budget, move |_| {
+            .run(Lane::Short, context.clone(), move |_| {
                 protocol(&snapshot, request, most_steps)
             })
             .await?;
@@ -45,7 +44,7 @@ impl EvaluationService for Handlers {
         let (events, stream) = mpsc::channel(16);
         let run = self
             .clone()
-            .run_evaluation(served, protocol, budget, events);
+            .run_evaluation(served, protocol, context, events);
         tokio::spawn(run.instrument(tracing::Span::current()));
 
         Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
@@ -58,7 +57,7 @@ impl EvaluationService for Handlers {
         let most = self.config.predictions;
         self.unary(
             request,
-            |_| Lane::Long,
+            |_, _| Lane::Long,
             move |snapshot, request, cancel| score(snapshot, request, most, cancel),
         )
         .await
@@ -71,7 +70,7 @@ impl Handlers {
         self,
         served: Arc<ServedNavigator>,
         protocol: Protocol,
-        budget: Duration,
+        context: CallContext,
         events: Events,
     ) {
         let caller = events.clone();
@@ -95,7 +94,7 @@ impl Handlers {
 
         // If the caller closes the stream, `run` is dropped, which cancels the computation.
         let finished = tokio::select! {
-            finished = self.workers.run(Lane::Long, budget, work) => finished,
+            finished = self.workers.run(Lane::Evaluation, context, work) => finished,
             () = caller.closed() => return,
         };
 

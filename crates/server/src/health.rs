@@ -21,6 +21,10 @@ use seese3_client::proto::v1::localization_service_server::LocalizationServiceSe
 use seese3_client::proto::v1::navigation_service_server::NavigationServiceServer;
 use seese3_client::proto::v1::odometry_service_server::OdometryServiceServer;
 
+/// The RPCs that need no credentials.
+pub const HEALTH_CHECK: &str = "/grpc.health.v1.Health/Check";
+pub const HEALTH_WATCH: &str = "/grpc.health.v1.Health/Watch";
+
 const SERVICES: [&str; 6] = [
     "",
     <NavigationServiceServer<Handlers> as NamedService>::NAME,

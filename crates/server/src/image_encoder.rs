@@ -5,12 +5,13 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
 
+use super::decoding::DecodingMemory;
 use super::metrics::Metrics;
 use super::{Error, RunError};
 use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
 use seese3_core::keypoints::KeypointSource;
-use seese3_encoder::{Bounds, EncodedFrame, Encoder, Runtime, decode};
+use seese3_encoder::{Bounds, EncodedFrame, Encoder, Runtime, decode, decoding_cost};
 use seese3_store::StoredAdapter;
 
 /// Configuration of the image encoders.
@@ -22,23 +23,58 @@ pub struct ImageEncoders {
     pub runtime: Runtime,
     /// The largest size of one image, encoded and decoded.
     pub bounds: Bounds,
+    /// The largest number of pixels of all images of one request.
+    pub request_pixels: u64,
+}
+
+impl ImageEncoders {
+    /// Default of `request_pixels`: 256 images of 1280 × 720 pixels, or 16 of 16 million.
+    pub const REQUEST_PIXELS: u64 = 1 << 28;
 }
 
 /// Encodes images for one adapter.
 pub struct ImageEncoder {
     encoder: Encoder,
     bounds: Bounds,
+    request_pixels: u64,
+    decoding: Arc<DecodingMemory>,
     metrics: Option<Metrics>,
 }
 
 impl ImageEncoder {
-    /// Encodes with `encoder`, and refuses images larger than `bounds`.
-    pub fn new(encoder: Encoder, bounds: Bounds) -> Self {
+    /// Encodes with `encoder` within the limits of `encoders`. Images are decoded within
+    /// `decoding`.
+    pub fn new(encoder: Encoder, encoders: &ImageEncoders, decoding: Arc<DecodingMemory>) -> Self {
         Self {
             encoder,
-            bounds,
+            bounds: encoders.bounds,
+            request_pixels: encoders.request_pixels,
+            decoding,
             metrics: None,
         }
+    }
+
+    /// Checks the number of pixels of a request's images before any is decoded.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] on `field` if it is over the limit of a request.
+    pub fn check_pixels<'a>(
+        &self,
+        field: &str,
+        images: impl Iterator<Item = &'a [u8]>,
+    ) -> Result<(), Error> {
+        // An image without a valid header is refused when its turn comes.
+        let costs = images.filter_map(decoding_cost);
+        let pixels = costs.fold(0, |sum: u64, cost| sum.saturating_add(cost.pixels));
+        if pixels <= self.request_pixels {
+            return Ok(());
+        }
+
+        let problem = format!(
+            "have {pixels} pixels together, over the limit of {} for one request; send fewer or smaller images",
+            self.request_pixels
+        );
+        Err(Error::invalid(field, problem))
     }
 
     /// The limits on an image.
@@ -70,6 +106,8 @@ impl ImageEncoder {
     /// # Errors
     /// As [`ImageEncoder::feature`].
     pub fn decoded(&self, field: &str, image: &[u8]) -> Result<RgbImage, Error> {
+        let cost = decoding_cost(image).map_or(0, |cost| cost.bytes);
+        let _memory = self.decoding.wait(cost);
         decode("image", image, self.bounds).map_err(|error| request_error(field, error))
     }
 
@@ -169,6 +207,7 @@ pub fn open_for(
     adapter: &str,
     source: &FeatureSource,
     encoders: &ImageEncoders,
+    decoding: Arc<DecodingMemory>,
 ) -> Result<Option<ImageEncoder>, seese3_encoder::Error> {
     let made_by = Encoder::of_source(source, &encoders.models, &encoders.runtime)?;
     let Some(encoder) = made_by else {
@@ -208,5 +247,5 @@ pub fn open_for(
         runtime = encoder.runtime(),
         "image encoder ready"
     );
-    Ok(Some(ImageEncoder::new(encoder, encoders.bounds)))
+    Ok(Some(ImageEncoder::new(encoder, encoders, decoding)))
 }

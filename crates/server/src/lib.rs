@@ -22,22 +22,28 @@
 mod health;
 mod holding_body;
 mod shutdown;
+mod slow_files;
 mod status;
 mod tls;
 #[cfg(feature = "otlp")]
 mod traces;
+mod rpcs;
 mod metrics;
 mod connections;
+mod decoding;
 mod image_encoder;
 mod request_metrics;
 mod operations;
-mod workers;
 mod auth;
+mod caller;
+mod shares;
+mod workers;
 mod memory;
 mod telemetry;
 mod two_views;
 mod snapshot;
 mod convert;
+mod cost;
 mod embedding;
 mod image_view;
 mod reload;
@@ -81,8 +87,9 @@ use tower_http::trace::TraceLayer;
 
 use auth::{AuthLayer, Principal};
 use catalog::Changes;
+use cost::Costs;
 use health::RoomHealth;
-use memory::{Memory, MemoryLayer, respond};
+use memory::{Memory, MemoryLayer, respond, with_lease};
 use reload::ReloadHandle;
 use request_metrics::RequestMetricsLayer;
 use seese3_client::proto::FILE_DESCRIPTOR_SET;
@@ -97,10 +104,10 @@ use seese3_store::Store;
 use snapshot::Loader;
 use workers::{Lane, Workers};
 
+/// Divisor for the memory budget of images that are decoded: 1/4 of the request budget.
+const DECODING: usize = 4;
 /// Divisor for the memory budget of health watchers: 1/8 of the request budget.
 const WATCHERS: usize = 8;
-/// Memory budget of health checks, bytes.
-const PROBES: usize = 16 << 20;
 /// Time after draining in which callers can still receive their last responses or errors.
 const LAST_WORDS: Duration = Duration::from_secs(1);
 
@@ -134,11 +141,11 @@ pub struct Config {
     pub upload_bytes: usize,
     /// Maximum size of a received message, bytes.
     pub message_bytes: usize,
-    /// Worker threads for short requests, and as many for requests with images. Batches and
-    /// evaluations get half as many, rounded up.
+    /// Worker threads for short requests, and as many for requests with images. Long requests, and
+    /// evaluations and fits, get half as many each, rounded up.
     pub threads: usize,
     /// Maximum number of requests that wait for a thread, for each of these kinds; further ones are
-    /// refused.
+    /// refused. Callers share these places.
     pub queue: usize,
     /// Time limit of one request. A caller's deadline can only shorten it.
     pub longest: Duration,
@@ -280,7 +287,7 @@ impl Handlers {
     async fn unary<Q, A>(
         &self,
         request: Request<Q>,
-        lane: impl FnOnce(&Q) -> Lane,
+        lane: impl FnOnce(&Costs<'_>, &Q) -> Lane,
         work: impl FnOnce(&Snapshot, Q, &Cancellation) -> Result<A, Error> + Send + 'static,
     ) -> Result<Response<A>, Status>
     where
@@ -288,12 +295,16 @@ impl Handlers {
         A: Message + 'static,
     {
         let snapshot = self.snapshot(&request)?;
-        let budget = self.workers.budget(request.metadata());
+        let context = self.workers.context(&request);
         let request = request.into_inner();
-        let lane = lane(&request);
+        let costs = Costs {
+            snapshot: &snapshot,
+            index: self.config.index,
+        };
+        let lane = lane(&costs, &request);
 
         let work = move |cancel: &Cancellation| work(&snapshot, request, cancel);
-        respond(self.workers.run(lane, budget, work).await?)
+        respond(self.workers.run(lane, context, with_lease(work)).await?)
     }
 }
 
@@ -475,7 +486,6 @@ fn memory_layer(config: &Config) -> MemoryLayer {
         message_bytes: config.message_bytes,
         receive_within: config.receive_within,
         response_timeout: config.response_timeout,
-        probes: Memory::new(PROBES, config.metrics.clone()),
         watchers: Memory::new(config.memory_bytes / WATCHERS, config.metrics.clone()),
     }
 }

@@ -10,7 +10,6 @@ use super::convert;
 use super::image_view::{ImageView, RoomMatches, Searched, ViewFields};
 use super::snapshot::{ServedNavigator, ServedRoom};
 use super::status::view_error;
-use super::workers::Lane;
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::localization_service_server::LocalizationService;
@@ -42,7 +41,7 @@ impl LocalizationService for Handlers {
         let response = self
             .unary(
                 request,
-                |request| Lane::of(&request.view),
+                |costs, request| costs.locate(&request.rooms, request.view.as_slice()),
                 move |snapshot, request, cancel| answer(snapshot, request, most, cancel),
             )
             .await?;

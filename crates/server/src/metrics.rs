@@ -3,7 +3,6 @@
 //! Every name begins with `seese3_`. Label values come from closed sets, never from requests, so
 //! that callers cannot create new time series.
 
-use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -15,10 +14,9 @@ use prometheus_client::metrics::gauge::{ConstGauge, Gauge};
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
-use prost::Message;
-use prost_types::FileDescriptorSet;
 use strum::{IntoStaticStr, VariantArray};
 
+use super::rpcs::known_path;
 use super::status::Full;
 use seese3_client::proto::v1::TrackStatus;
 
@@ -29,8 +27,6 @@ pub struct Metrics(Arc<Inner>);
 #[derive(Debug)]
 struct Inner {
     registry: Mutex<Registry>,
-    /// The paths of all RPCs. Any other path is labeled "unknown".
-    methods: BTreeSet<String>,
     requests: Family<RequestLabels, Histogram>,
     in_flight: Gauge,
     frames: Family<FrameLabels, Histogram>,
@@ -45,7 +41,7 @@ struct Inner {
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
 struct RequestLabels {
-    method: String,
+    method: &'static str,
     code: &'static str,
 }
 
@@ -111,12 +107,6 @@ impl Default for Metrics {
             refused: Family::default(),
             reloads: Family::default(),
             registry: Mutex::default(),
-            methods: methods(&[
-                seese3_client::proto::FILE_DESCRIPTOR_SET,
-                tonic_health::pb::FILE_DESCRIPTOR_SET,
-                tonic_reflection::pb::v1::FILE_DESCRIPTOR_SET,
-                tonic_reflection::pb::v1alpha::FILE_DESCRIPTOR_SET,
-            ]),
         };
         metrics.describe(&mut registry);
         metrics.begin_at_zero();
@@ -270,9 +260,8 @@ impl Metrics {
     pub(super) fn request_ended(&self, method: &str, code: tonic::Code, took: Duration) {
         self.0.in_flight.dec();
 
-        let known = self.0.methods.get(method).map(String::as_str);
         let labels = RequestLabels {
-            method: known.unwrap_or("unknown").to_owned(),
+            method: known_path(method).unwrap_or("unknown"),
             code: code_name(code),
         };
         let requests = self.0.requests.get_or_create(&labels);
@@ -365,32 +354,6 @@ impl Collector for Elsewhere {
             }
         }
     }
-}
-
-/// The paths of all RPCs in these file descriptor sets.
-fn methods(descriptors: &[&[u8]]) -> BTreeSet<String> {
-    let mut paths = BTreeSet::new();
-    for bytes in descriptors {
-        // The descriptors are compiled in. The RPCs of an unreadable one are labeled "unknown".
-        let Ok(set) = FileDescriptorSet::decode(*bytes) else {
-            continue;
-        };
-
-        for file in &set.file {
-            for service in &file.service {
-                for method in &service.method {
-                    paths.insert(format!(
-                        "/{}.{}/{}",
-                        file.package(),
-                        service.name(),
-                        method.name()
-                    ));
-                }
-            }
-        }
-    }
-
-    paths
 }
 
 /// The name of a code in the gRPC specification.

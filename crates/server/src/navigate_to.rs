@@ -6,7 +6,7 @@
 
 use std::pin::Pin;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use tokio::sync::mpsc;
 use tokio_stream::{Stream, wrappers::ReceiverStream};
@@ -14,11 +14,13 @@ use tonic::Status;
 use tracing::Instrument;
 
 use super::convert;
+use super::cost::{frame_bytes, lane};
 use super::image_view::{ImageView, Searched, ViewFields};
 use super::localization::localizer;
+use super::memory::MemoryLease;
 use super::snapshot::{ServedNavigator, Snapshot};
 use super::status::view_error;
-use super::workers::Lane;
+use super::workers::{CallContext, Lane};
 use super::{Error, Handlers};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::navigate_to_request::Goal;
@@ -40,7 +42,7 @@ use seese3_robot::tracking::{MapQuery, PoseWithCovariance};
 /// Stream of feedback events and the final result.
 pub type Events = Pin<Box<dyn Stream<Item = Result<pb::NavigateToResponse, Status>> + Send>>;
 
-/// In rooms with more frames than this, planning runs in the lane of batches and evaluations. It
+/// In rooms with more frames than this, planning runs in the lane of long requests. It
 /// takes some 10 ms at this size.
 const MOST_SHORT_FRAMES: usize = 5_000;
 
@@ -65,6 +67,40 @@ enum Ended {
     Planned(Planned),
 }
 
+/// Memory of the events that the caller has not read: all of them until the response ends.
+struct EventMemory {
+    lease: Option<MemoryLease>,
+    event_bytes: usize,
+    event_count: usize,
+}
+
+impl EventMemory {
+    /// Reserves memory for a route of the maximum length.
+    ///
+    /// # Errors
+    /// [`Error::Full`] if there is no memory for it.
+    fn hold(event_count: usize, event_bytes: usize) -> Result<Self, Error> {
+        let lease = MemoryLease::current();
+        if let Some(lease) = &lease {
+            lease.hold(event_count * event_bytes)?;
+        }
+        Ok(Self {
+            lease,
+            event_bytes,
+            event_count,
+        })
+    }
+
+    /// Keeps the memory of `event_count` events.
+    fn keep(&mut self, event_count: usize) {
+        let unused = self.event_count.saturating_sub(event_count);
+        if let Some(lease) = &self.lease {
+            lease.release(unused * self.event_bytes);
+        }
+        self.event_count -= unused;
+    }
+}
+
 impl Handlers {
     /// Validates a request on a worker thread and starts planning.
     pub(super) async fn begin_pursuit(
@@ -73,7 +109,7 @@ impl Handlers {
     ) -> Result<Events, Error> {
         let snapshot = self.snapshot(&request)?;
         let most = self.config.limits.steps;
-        let budget = self.workers.budget(request.metadata());
+        let context = self.workers.context(&request);
         let request = request.into_inner();
         let lane = Lane::of(&request.source);
 
@@ -82,16 +118,24 @@ impl Handlers {
         // Validation may encode an image: it runs on a worker thread and uses part of the budget.
         let ready = self
             .workers
-            .run(lane, budget, move |_| ready(&snapshot, request, most))
+            .run(lane, context.clone(), move |_| {
+                ready(&snapshot, request, most)
+            })
             .await?;
+
+        // All events stay in memory until the caller has read them.
+        let event_count = ready.pursuit.steps as usize + 2;
+        let room = ready.served.navigator.room();
+        let event_bytes = size_of::<pb::NavigateToResponse>() + frame_bytes(room);
+        let memory = EventMemory::hold(event_count, event_bytes)?;
 
         // The channel holds all events: feedback before the first step and after each step, and the
         // result. No event is lost, and no worker thread waits for a slow reader.
-        let (events, stream) = mpsc::channel(ready.pursuit.steps as usize + 2);
-        let left = budget.saturating_sub(begun.elapsed());
+        let (events, stream) = mpsc::channel(event_count);
+        let left = context.after(begun.elapsed());
         tokio::spawn(
             self.clone()
-                .pursue(ready, left, events)
+                .pursue(ready, left, events, memory)
                 .instrument(tracing::Span::current()),
         );
 
@@ -102,17 +146,26 @@ impl Handlers {
     async fn pursue(
         self,
         ready: CheckedRequest,
-        budget: Duration,
+        context: CallContext,
         events: mpsc::Sender<Result<pb::NavigateToResponse, Status>>,
+        mut memory: EventMemory,
     ) {
         let caller = events.clone();
         let begun = Instant::now();
         let frame_count = ready.served.navigator.room().frame_count();
-        let is_graph = ready.planner != pb::Planner::Latent;
+        let lane = match ready.planner {
+            // Each step compares all frames.
+            pb::Planner::Latent => lane(0, f64::from(ready.pursuit.steps) * frame_count as f64),
+            // Planning time grows with the square of the number of frames.
+            _ if frame_count > MOST_SHORT_FRAMES => Lane::Long,
+            _ => Lane::Short,
+        };
 
         let work = move |cancel: &Cancellation| {
             let start = start_to_wire(&ready.start, &ready.served);
+            let mut sent = 0;
             let mut each = |feedback: Feedback| {
+                sent += 1;
                 let mut feedback = feedback_to_wire(&feedback, &ready.served, begun);
                 if feedback.current_step == 0 {
                     feedback.start = Some(start.clone());
@@ -126,19 +179,13 @@ impl Handlers {
             };
 
             let ended = ready.plan(cancel, &mut each)?;
+            memory.keep(sent + 1);
             Ok(result_to_wire(&ended, &ready))
-        };
-
-        // Planning time grows with the square of the number of frames.
-        let lane = if is_graph && frame_count > MOST_SHORT_FRAMES {
-            Lane::Long
-        } else {
-            Lane::Short
         };
 
         // If the caller closes the stream, `run` is dropped, which cancels planning.
         let finished = tokio::select! {
-            finished = self.workers.run(lane, budget, work) => finished,
+            finished = self.workers.run(lane, context, work) => finished,
             () = caller.closed() => return,
         };
         let last = finished

@@ -3,12 +3,16 @@
 use tonic::{Request, Response, Status};
 
 use super::convert;
+use super::cost::{frame_bytes, step_bytes, step_count};
+use super::memory::hold_for_answer;
+use super::snapshot::ServedNavigator;
 use super::status::brief;
-use super::workers::Lane;
+use super::workers::{Lane, image_count, images_of};
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::navigation_service_server::NavigationService;
 use seese3_core::cancel::Cancellation;
+use seese3_core::eval::default_thresholds;
 use seese3_core::navigation::Limits;
 
 #[tonic::async_trait]
@@ -21,7 +25,7 @@ impl NavigationService for Handlers {
         let response = self
             .unary(
                 request,
-                |request| Lane::of(&request.source),
+                |costs, request| costs.navigate(request),
                 move |snapshot, request, cancel| navigate(snapshot, request, limits, cancel),
             )
             .await?;
@@ -49,23 +53,16 @@ impl NavigationService for Handlers {
     ) -> Result<Response<pb::BatchNavigateResponse>, Status> {
         let limits = self.config.limits;
         let most = self.config.batch;
-        self.unary(request, batch_lane, move |snapshot, request, cancel| {
-            check_batch(&request.requests, most, limits)?;
-            answer_batch(snapshot, request, limits, cancel)
-        })
+        self.unary(
+            request,
+            |_, _| Lane::Long,
+            move |snapshot, request, cancel| {
+                check_batch(&request.requests, most, limits)?;
+                check_batch_pixels(snapshot, &request.requests)?;
+                answer_batch(snapshot, request, limits, cancel)
+            },
+        )
         .await
-    }
-}
-
-/// The lane of a batch: [`Lane::Images`] if any view is an image, else [`Lane::Long`].
-fn batch_lane(batch: &pb::BatchNavigateRequest) -> Lane {
-    let sources = batch
-        .requests
-        .iter()
-        .filter_map(|request| request.source.as_ref());
-    match Lane::of(sources) {
-        Lane::Images => Lane::Images,
-        Lane::Short | Lane::Long => Lane::Long,
     }
 }
 
@@ -92,6 +89,34 @@ fn check_batch(requests: &[pb::NavigateRequest], most: usize, limits: Limits) ->
         return Err(Error::invalid("requests", problem));
     }
     Ok(())
+}
+
+/// Checks the number of pixels of a batch's images. The limit is the same for all adapters.
+fn check_batch_pixels(snapshot: &Snapshot, requests: &[pb::NavigateRequest]) -> Result<(), Error> {
+    let sources = || {
+        requests
+            .iter()
+            .filter_map(|request| request.source.as_ref())
+    };
+    match snapshot.any_image_encoder() {
+        Some(encoder) if image_count(sources()) > 0 => {
+            encoder.check_pixels("requests", images_of(sources()))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Upper bound of the encoded size of an answer, bytes. A request over the limits is refused, so
+/// they bound it too.
+fn answer_bytes(served: &ServedNavigator, request: &pb::NavigateRequest, limits: Limits) -> usize {
+    let steps = step_count(request).min(u64::from(limits.steps)) as usize;
+    let frames = frames_requested(request).min(limits.frames_in_answer) as usize;
+    let room = served.navigator.room();
+    let thresholds = request.thresholds.len().max(default_thresholds().len());
+
+    let latent_dim = served.adapter.adapter.latent_dim();
+    let of_frames = frames.saturating_mul(frame_bytes(room));
+    of_frames.saturating_add(steps.saturating_mul(step_bytes(latent_dim, thresholds)))
 }
 
 fn answer_batch(
@@ -124,17 +149,7 @@ fn answer_batch(
 /// Number of frames that a request asks for: motions × steps × top_k. Used only for the batch
 /// limit; each request is validated when it is answered.
 fn frames_requested(request: &pb::NavigateRequest) -> u64 {
-    let motions = match request
-        .displacement
-        .as_ref()
-        .and_then(|given| given.displacement.as_ref())
-    {
-        Some(pb::displacement::Displacement::Twists(list)) => list.twists.len() as u64,
-        _ => 1,
-    };
-
-    let steps = u64::from(request.steps.unwrap_or(1)).saturating_mul(motions);
-    steps.saturating_mul(u64::from(request.top_k.unwrap_or(1)))
+    step_count(request).saturating_mul(u64::from(request.top_k.unwrap_or(1)))
 }
 
 fn navigate(
@@ -144,6 +159,7 @@ fn navigate(
     cancel: &Cancellation,
 ) -> Result<pb::NavigateResponse, Error> {
     let served = snapshot.navigator(&request.room, &request.adapter)?;
+    hold_for_answer(answer_bytes(&served, &request, limits))?;
     let (query, thresholds) = convert::query(request, &served.adapter, snapshot)?;
     let answer = served.navigator.answer(&query, limits, cancel)?;
 

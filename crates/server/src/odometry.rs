@@ -31,10 +31,12 @@ impl OdometryService for Handlers {
         &self,
         request: Request<pb::EstimateMotionRequest>,
     ) -> Result<Response<pb::EstimateMotionResponse>, Status> {
-        let lane = |request: &pb::EstimateMotionRequest| {
-            Lane::of(request.first.iter().chain(&request.second))
-        };
-        self.unary(request, lane, answer).await
+        self.unary(
+            request,
+            |_, request| Lane::of(request.first.iter().chain(&request.second)),
+            answer,
+        )
+        .await
     }
 
     async fn encode(

@@ -10,7 +10,7 @@ use super::embedding::{EmbeddedView, StoredFrames, ViewEmbedder};
 use super::image_view::{ImageView, RoomMatches, Searched, ViewFields};
 use super::localization::{self, LocatedPose, asked_rooms, localizer, rooms_under};
 use super::snapshot::{ServedNavigator, ServedRoom, Snapshot};
-use super::workers::Lane;
+use super::workers::{image_count, images_of};
 use super::{Error, Handlers};
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
@@ -35,7 +35,7 @@ impl Handlers {
         let most = self.config.limits.top_k;
         self.unary(
             request,
-            |request| Lane::of(&request.views),
+            |costs, request| costs.locate(&request.rooms, &request.views),
             move |snapshot, request, cancel| answer(snapshot, request, most, cancel),
         )
         .await
@@ -280,6 +280,11 @@ fn embedded(
         frames: StoredFrames::Refused,
         detector: None,
     };
+
+    if image_count(&views) > 0 {
+        let encoder = snapshot.image_encoder(stored)?;
+        encoder.check_pixels("views", images_of(&views))?;
+    }
 
     let mut embedded = Vec::with_capacity(views.len());
     for (position, view) in views.into_iter().enumerate() {

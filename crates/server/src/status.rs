@@ -23,9 +23,15 @@ pub enum Full {
     /// The lane of requests with images.
     #[strum(serialize = "requests with images")]
     Images,
-    /// The lane of batches and evaluations.
-    #[strum(serialize = "batches and evaluations")]
+    /// The lane of batches and other long requests.
+    #[strum(serialize = "batches and long requests")]
     LongRequests,
+    /// The lane of evaluations.
+    #[strum(serialize = "evaluations")]
+    Evaluations,
+    /// The queued requests of one caller.
+    #[strum(serialize = "queued requests of this caller")]
+    CallersQueue,
     /// The server's Track streams.
     #[strum(serialize = "Track streams")]
     Streams,
@@ -40,13 +46,28 @@ pub enum Full {
     /// The bytes of all uploads in progress.
     #[strum(serialize = "bytes of uploads")]
     Uploads,
-    /// The fits in progress; only one runs at a time.
+    /// One caller's share of the bytes of uploads.
+    #[strum(serialize = "bytes of uploads of this caller")]
+    CallersUploads,
+    /// The lane of fits.
     Fits,
+    /// The fits of one caller; only one is queued or runs at a time.
+    #[strum(serialize = "fits of this caller")]
+    CallersFits,
     /// The memory of requests in progress.
     #[strum(serialize = "bytes of requests")]
     Memory,
+    /// One caller's share of the memory of requests.
+    #[strum(serialize = "bytes of requests of this caller")]
+    CallersMemory,
+    /// The health calls of a connection.
+    #[strum(serialize = "health calls of this connection")]
+    HealthCalls,
     /// The queued changes of the catalog.
     Changes,
+    /// The queued changes of one caller.
+    #[strum(serialize = "changes of this caller")]
+    CallersChanges,
 }
 
 /// An error of a request. Its name is the reason in `google.rpc.ErrorInfo`.
@@ -75,6 +96,9 @@ pub enum Error {
     #[error("the server is busy: the limit of {what} is reached; try again later")]
     #[strum(serialize = "BUSY")]
     Full { what: Full },
+    #[error("this server has no such RPC")]
+    #[strum(serialize = "UNKNOWN_RPC")]
+    UnknownPath,
     #[error("{problem}")]
     Unauthenticated { problem: &'static str },
     #[error("{name}: {problem}")]
@@ -181,6 +205,7 @@ impl Error {
             Self::Transport { code, .. } => *code,
             Self::Loading => Code::Unavailable,
             Self::Full { .. } => Code::ResourceExhausted,
+            Self::UnknownPath => Code::Unimplemented,
             Self::Unauthenticated { .. } => Code::Unauthenticated,
             Self::Forbidden { .. } | Self::OutOfScope { .. } => Code::PermissionDenied,
             Self::Deadline => Code::DeadlineExceeded,

@@ -1,5 +1,6 @@
 //! TLS with certificate files, which are reloaded when they change.
 
+use super::slow_files::read_within_limit;
 use seese3_core::Cause;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, PoisonError, RwLock};
@@ -13,6 +14,8 @@ use tokio_rustls::rustls::crypto::ring;
 use tokio_rustls::rustls::server::WebPkiClientVerifier;
 use tokio_rustls::rustls::{RootCertStore, ServerConfig};
 
+/// Maximum size of a certificate or key file, bytes.
+const MAX_FILE_BYTES: u64 = 16 << 20;
 /// Interval for checking the files for changes.
 const LOOK: Duration = Duration::from_secs(5);
 
@@ -87,9 +90,9 @@ impl Tls {
         loop {
             tokio::time::sleep(LOOK).await;
 
-            // Read on a blocking thread: a stalled file system must not block the runtime.
             let files = self.files.clone();
-            let Ok(found) = tokio::task::spawn_blocking(move || read(&files)).await else {
+            let found = read_within_limit("the certificate files", move || read(&files));
+            let Ok(found) = found.await else {
                 return;
             };
             match found {
@@ -120,11 +123,12 @@ fn read(files: &TlsFiles) -> Result<(ServerConfig, [u8; 32]), TlsError> {
     } = files;
     let mut digest = Sha256::new();
     let mut content = |option, file: &Path| {
-        let bytes = std::fs::read(file).map_err(|problem| TlsError::Unreadable {
-            option,
-            file: file.to_owned(),
-            problem,
-        })?;
+        let bytes =
+            seese3_files::read(file, MAX_FILE_BYTES).map_err(|problem| TlsError::Unreadable {
+                option,
+                file: file.to_owned(),
+                problem,
+            })?;
         digest.update((bytes.len() as u64).to_le_bytes());
         digest.update(&bytes);
         Ok(bytes)

@@ -8,6 +8,7 @@ use super::adapter_files::{
 };
 use super::format::{AdapterBody, FittedEntry, TrainingEntry};
 use super::manifest::{self, ObjectRef, SCHEMA};
+use super::publication::Publication;
 use super::stored_adapter::{RoomFit, StoredAdapter};
 use super::{ATTEMPTS, Defaults, Error, Kind, Published, Store, folder_of, revision_path};
 use seese3_core::adapter::{Adapter, TrainingRecord};
@@ -124,6 +125,8 @@ impl Store {
     ) -> Result<Published, Error> {
         let folder = folder_of(Kind::Adapter, name);
 
+        let publication = Publication::begin(&self.clock);
+
         // Write the weights before the manifest that makes them visible.
         let content = weights;
         let weights = self
@@ -166,7 +169,12 @@ impl Store {
 
             let manifest = revision_path(&folder, body.revision).to_string();
             if self
-                .write_manifest(&folder, body.revision, manifest::encode(&manifest, &body)?)
+                .write_manifest(
+                    &publication,
+                    &folder,
+                    body.revision,
+                    manifest::encode(&manifest, &body)?,
+                )
                 .await?
             {
                 // From now on the manifest protects its object from garbage collection. An object

@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use seese3_core::adapter::{Adapter, EpochProgress};
+use seese3_core::adapter::Adapter;
 use seese3_core::features::Features;
 use seese3_core::room::{FrameId, RoomId, is_plain_name};
 use seese3_core::training::RoomData;
-use seese3_robot::fitting::{self, Fitted, fit};
+use seese3_robot::fitting::{self, FitRun, Fitted, fit};
 
 use crate::{BaseAdapter, Published, RoomFit, Store, StoredAdapter, StoredRoom};
 
@@ -106,16 +106,15 @@ impl Refit {
         }
     }
 
-    /// Runs the fit. `progress` is called after each epoch, [`fitting::FITTING_EPOCHS`] times in
-    /// all.
+    /// Runs the fit.
     ///
     /// # Errors
     /// [`Error::Fitting`], as [`fit`].
-    pub fn fit(&self, progress: &(dyn Fn(EpochProgress) + Sync)) -> Result<Fitted, Error> {
+    pub fn fit(&self, run: FitRun<'_>) -> Result<Fitted, Error> {
         let frame_count = self.stored.room.frame_count();
         let mapped: Vec<FrameId> = (0..frame_count as u32).map(FrameId).collect();
         let network: Option<&Arc<Adapter>> = self.base.as_ref().map(|stored| &stored.adapter);
-        let mut fitted = fit(&self.data(), &mapped, network, self.seed, progress)?;
+        let mut fitted = fit(&self.data(), &mapped, network, self.seed, run)?;
 
         // The fitted adapter inherits the base's training data.
         if let Some(base) = &self.base {

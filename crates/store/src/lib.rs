@@ -36,6 +36,7 @@
 
 pub mod fit_stored_room;
 mod bucket;
+mod publication;
 mod manifest;
 mod resource;
 mod stored_adapter;
@@ -61,8 +62,9 @@ pub use adapter_files::{check_adapter_files, stated_weights_size};
 pub use contents::{Contents, RevisionContents};
 pub use defaults::{Choice, Defaults, StandingDefaults};
 pub use extension::{ExtendedRoom, OtherFeatures};
-pub use garbage::{Garbage, GarbageFile};
+pub use garbage::{Garbage, GarbageFile, GarbagePolicy, Publishers};
 pub use map_edits::EditedRoom;
+pub use publication::{Clock, GRACE, LONGEST_PUBLICATION};
 pub use removal::Removed;
 pub use resource::{Kind, ResourceName, ResourceNameError};
 pub use room_keypoints::{HeaderError, KeypointsHeader, RoomKeypoints};
@@ -71,12 +73,14 @@ pub use stored_adapter::{BaseAdapter, RoomFit, StoredAdapter};
 pub use verification::Finding;
 
 use seese3_core::Cause;
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt, PutMode, PutOptions, PutPayload};
+use publication::Publication;
 use sha2::{Digest, Sha256};
 use tokio_stream::StreamExt;
 
@@ -101,6 +105,18 @@ pub enum Error {
         name: String,
         known: Vec<String>,
     },
+    #[error(
+        "{manifest}: the publication took longer than {} minutes, so garbage collection may have removed its \
+         objects; publish again, over a faster connection",
+        LONGEST_PUBLICATION.as_secs() / 60
+    )]
+    TooSlow { manifest: String },
+    #[error(
+        "files younger than {} minutes may belong to a publication in progress; keep them, or state that \
+         nothing publishes to the store: --no-concurrent-publishers",
+        GRACE.as_secs() / 60
+    )]
+    Grace,
     #[error("{kind} '{name}' has no revision {revision}; its newest is {newest}")]
     UnknownRevision {
         kind: &'static str,
@@ -226,6 +242,8 @@ pub struct Store {
     location: String,
     /// The folder of a local store.
     folder: Option<PathBuf>,
+    /// Measures how long publications take.
+    clock: Clock,
 }
 
 /// The numbers of the files in a folder of numbered files, such as `revisions/`.
@@ -276,6 +294,7 @@ impl Store {
                 objects: Arc::new(objects),
                 location: location.to_owned(),
                 folder: None,
+                clock: Clock::default(),
             });
         }
 
@@ -296,6 +315,7 @@ impl Store {
             objects: Arc::new(objects),
             location: location.to_owned(),
             folder: Some(PathBuf::from(location)),
+            clock: Clock::default(),
         })
     }
 
@@ -305,7 +325,13 @@ impl Store {
             objects,
             location: location.to_owned(),
             folder: None,
+            clock: Clock::default(),
         }
+    }
+
+    /// The same store with another clock for the time limit of publications.
+    pub fn with_clock(self, clock: Clock) -> Self {
+        Self { clock, ..self }
     }
 
     /// The folder or URL, exactly as the caller gave it.
@@ -369,7 +395,13 @@ impl Store {
     ) -> Result<(String, Vec<u8>), Error> {
         let path = folder.clone().join("objects").join(object.file.as_str());
         let file = self.shown(&path);
-        let bytes = self.read(&path).await?;
+        let bytes = match self.read(&path).await {
+            Err(Error::Absent { file }) => self
+                .read_from_quarantine(folder, &object.file)
+                .await?
+                .ok_or(Error::Absent { file })?,
+            read => read?,
+        };
 
         // The length is compared first: it needs no hashing, and a difference indicates truncation.
         let problem = if bytes.len() as u64 != object.bytes {
@@ -417,8 +449,9 @@ impl Store {
         })
     }
 
-    /// Whether an object referenced by a revision is missing: a concurrent garbage collection may
-    /// have removed it during publication.
+    /// Whether an object referenced by a revision is missing or incomplete: a concurrent garbage
+    /// collection may have removed it during publication, and a publication of the same content may
+    /// have been interrupted.
     async fn lacks<'a>(
         &self,
         folder: &Path,
@@ -427,8 +460,8 @@ impl Store {
         for object in objects {
             let path = folder.clone().join("objects").join(object.file.as_str());
             match self.objects.head(&path).await {
-                Ok(_) => {}
-                Err(object_store::Error::NotFound { .. }) => return Ok(true),
+                Ok(found) if found.size == object.bytes => {}
+                Ok(_) | Err(object_store::Error::NotFound { .. }) => return Ok(true),
                 Err(error) => return Err(self.io(&path, error)),
             }
         }
@@ -436,15 +469,33 @@ impl Store {
         Ok(false)
     }
 
-    /// Writes a manifest unless the revision already exists. Returns whether it was written.
+    /// Writes a manifest unless the revision exists or was removed. Returns whether the revision
+    /// exists now.
+    ///
+    /// # Errors
+    /// [`Error::TooSlow`] if the publication has taken too long; [`Error::Io`] if the store cannot
+    /// be written.
     async fn write_manifest(
         &self,
+        publication: &Publication,
         folder: &Path,
         revision: u64,
         bytes: Vec<u8>,
     ) -> Result<bool, Error> {
-        self.write_new(&revision_path(folder, revision), bytes)
-            .await
+        let path = revision_path(folder, revision);
+        publication.check(&self.shown(&path))?;
+        if !self.write_new(&path, bytes).await? {
+            return Ok(false);
+        }
+
+        // The number may have been published and removed since it was chosen. Then the revision
+        // is not visible, and its number is not used again.
+        let gone = folder.clone().join("revisions").join(gone_name(revision));
+        match self.objects.head(&gone).await {
+            Ok(_) => Ok(false),
+            Err(object_store::Error::NotFound { .. }) => Ok(true),
+            Err(error) => Err(self.io(&gone, error)),
+        }
     }
 
     /// Writes a file unless it exists. Returns whether it was written. Atomic, also between
@@ -559,6 +610,7 @@ impl Store {
         self.check_folder(folder)?;
         let mut listed = self.objects.list(Some(folder));
         let mut numbers = Numbers::default();
+        let mut gone = BTreeSet::new();
 
         while let Some(entry) = listed.next().await {
             let entry = entry.map_err(|error| self.io(folder, error))?;
@@ -573,12 +625,17 @@ impl Store {
             // Only canonical names count: a copy such as `2.json` is not a revision.
             match extension {
                 "json" if name == manifest_name(number) => numbers.present.push(number),
-                "gone" if name == gone_name(number) => {}
+                "gone" if name == gone_name(number) => {
+                    gone.insert(number);
+                }
                 _ => continue,
             }
             numbers.highest = numbers.highest.max(number);
         }
 
+        // A removal may be interrupted before it deletes the manifest, and a stalled publication may
+        // write the manifest of a number that was published and removed meanwhile.
+        numbers.present.retain(|number| !gone.contains(number));
         numbers.present.sort_unstable();
         Ok(numbers)
     }

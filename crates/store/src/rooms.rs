@@ -5,6 +5,7 @@ use object_store::path::Path;
 
 use super::format::{FeaturesEntry, RoomBody};
 use super::manifest::{self, ObjectRef, SCHEMA};
+use super::publication::Publication;
 use super::room_files::{
     features_file, frames_file, names_file, read_features, read_frames, read_names,
 };
@@ -244,6 +245,7 @@ impl Store {
         }
 
         for _ in 0..ATTEMPTS {
+            let publication = Publication::begin(&self.clock);
             let (folder, revision) = self.resolve(Kind::Room, name, None).await?;
             let newest = self.room_body(&folder, revision).await?;
             let numbers = self.revisions(&folder).await?;
@@ -263,7 +265,17 @@ impl Store {
 
             let manifest = revision_path(&folder, body.revision).to_string();
             let bytes = manifest::encode(&manifest, &body)?;
-            if self.write_manifest(&folder, body.revision, bytes).await? {
+            if self
+                .write_manifest(&publication, &folder, body.revision, bytes)
+                .await?
+            {
+                // The objects are those of the base revision, which may have been removed.
+                if self.lacks(&folder, body.objects()).await? {
+                    let manifest = revision_path(&folder, body.revision);
+                    let removed = self.objects.delete(&manifest).await;
+                    removed.map_err(|error| self.io(&manifest, error))?;
+                    continue;
+                }
                 return Ok(Published {
                     revision: body.revision,
                     is_new: true,
@@ -294,6 +306,7 @@ impl Store {
         check_features(room, features)?;
         check_keypoints(room, keypoints)?;
         let folder = folder_of(Kind::Room, room.id().as_str());
+        let publication = Publication::begin(&self.clock);
 
         // A repeated import, for instance without images, must not lose stored data: missing
         // columns are filled in from the newest revision.
@@ -328,18 +341,8 @@ impl Store {
             }
 
             if let Some(newest) = &newest {
-                body.tracking = newest.tracking;
-                if newest.frames == body.frames || self.has_poses(&folder, newest, room).await? {
-                    let kept = features_to_keep(newest, &objects.features);
-                    body.features.extend(kept);
-                    let kept = keypoints_to_keep(newest, &body);
-                    body.keypoints = body.keypoints.or(kept);
-                } else if over == PublishPolicy::SameFrames {
-                    return Err(Error::OtherFrames {
-                        room: room.id().to_string(),
-                        revision: newest.revision,
-                    });
-                }
+                self.keep_from(&folder, newest, room, over, &mut body)
+                    .await?;
             }
 
             // A fixed order makes equal content compare equal.
@@ -352,7 +355,12 @@ impl Store {
 
             let manifest = revision_path(&folder, body.revision).to_string();
             if self
-                .write_manifest(&folder, body.revision, manifest::encode(&manifest, &body)?)
+                .write_manifest(
+                    &publication,
+                    &folder,
+                    body.revision,
+                    manifest::encode(&manifest, &body)?,
+                )
                 .await?
             {
                 if !self
@@ -372,6 +380,34 @@ impl Store {
         Err(Error::Contended {
             name: room.id().to_string(),
         })
+    }
+
+    /// Adds to a new manifest what the newest revision has and the publication lacks: parameters of
+    /// filters and, if the frames are the same, features and keypoints.
+    ///
+    /// # Errors
+    /// [`Error::OtherFrames`] if the frames differ although `over` demands the same.
+    async fn keep_from(
+        &self,
+        folder: &Path,
+        newest: &RoomBody,
+        room: &Room,
+        over: PublishPolicy,
+        body: &mut RoomBody,
+    ) -> Result<(), Error> {
+        body.tracking = newest.tracking;
+        if newest.frames == body.frames || self.has_poses(folder, newest, room).await? {
+            body.features
+                .extend(features_to_keep(newest, &body.features));
+            let kept = keypoints_to_keep(newest, body);
+            body.keypoints = body.keypoints.take().or(kept);
+        } else if over == PublishPolicy::SameFrames {
+            return Err(Error::OtherFrames {
+                room: room.id().to_string(),
+                revision: newest.revision,
+            });
+        }
+        Ok(())
     }
 
     /// Ensures that a new revision's objects exist; from now on its manifest protects them from

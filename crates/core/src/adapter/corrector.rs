@@ -13,6 +13,7 @@ use super::loss::mean_squared_error;
 use super::seeded::Seeded;
 use super::train::{EpochProgress, fit};
 use super::{Adapter, At, Error, Network, Objective, Reading, Real, Samples, TrainConfig};
+use crate::cancel::Cancellation;
 
 /// The architecture of a corrector.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, EnumString, IntoStaticStr)]
@@ -304,7 +305,8 @@ pub fn train_corrector(
     let samples = corrector_samples(adapter, samples)?;
     let mut random = Seeded::new(config.seed);
     let start = Corrector::random(kind, adapter.coordinate_count(), &mut random);
-    fit(&samples, start, config, &mut random, progress)
+    let cancel = Cancellation::default();
+    fit(&samples, start, config, &mut random, &cancel, progress)
 }
 
 fn corrector_samples(

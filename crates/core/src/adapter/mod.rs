@@ -54,6 +54,7 @@ pub mod building_blocks {
 
 use nalgebra::Vector6;
 
+use crate::cancel;
 use crate::geometry::Twist;
 
 /// Largest accepted magnitude of a number in a latent: far above what adapters produce and far
@@ -146,6 +147,8 @@ pub enum Error {
     NoMotion,
     #[error("training diverged in epoch {epoch}: the loss is {loss}; lower the learning rate")]
     Diverged { epoch: usize, loss: f64 },
+    #[error(transparent)]
+    Cancelled(#[from] cancel::Cancelled),
 }
 
 /// A twist component with a standard deviation below this (meters or radians) is constant up to

@@ -9,6 +9,7 @@ use super::network::AdamW;
 use super::phi::Widths;
 use super::seeded::Seeded;
 use super::{At, Error, LATENT_DIM, Loss, Mixing, Mixture, Objective, Real, Samples};
+use crate::cancel::Cancellation;
 
 /// Training settings. They are recorded with the adapter.
 #[derive(Debug, Clone, PartialEq)]
@@ -151,12 +152,13 @@ pub struct EpochProgress {
 /// weights.
 ///
 /// # Errors
-/// [`Error::Diverged`] when the loss is not finite.
+/// [`Error::Diverged`] when the loss is not finite, [`Error::Cancelled`] once `cancel` is set.
 pub fn fit<T: Real, N: Objective<T>>(
     data: &N::Data,
     start: N,
     config: &TrainConfig,
     random: &mut Seeded,
+    cancel: &Cancellation,
     progress: &mut dyn FnMut(EpochProgress),
 ) -> Result<N, Error> {
     let mut average = (config.average > 0.0).then(|| start.clone());
@@ -165,6 +167,7 @@ pub fn fit<T: Real, N: Objective<T>>(
         let order = random.permutation(N::count(data));
         let mut losses = Vec::new();
         for batch in order.chunks(config.batch.max(1)) {
+            cancel.check()?;
             losses.push(trainer.step(batch).loss);
 
             if let Some(average) = &mut average {
@@ -215,6 +218,7 @@ fn move_towards<T: Real, N: Objective<T>>(average: &mut N, weights: &N, share: f
 pub fn train(
     samples: &Samples<f32>,
     config: &TrainConfig,
+    cancel: &Cancellation,
     progress: &mut dyn FnMut(EpochProgress),
 ) -> Result<Mixture<f32>, Error> {
     if config.charts == 0 || config.charts > super::MAX_CHARTS {
@@ -230,7 +234,7 @@ pub fn train(
     // A single chart, or charts with a gate, are one network; the charts of an ensemble are trained
     // separately.
     if config.charts == 1 || config.mixing == Mixing::Gate {
-        return train_together(samples, config, progress);
+        return train_together(samples, config, cancel, progress);
     }
 
     // The epochs are divided among the charts, so that an ensemble takes about as many steps as a
@@ -252,7 +256,7 @@ pub fn train(
         };
 
         let done = member * epochs;
-        let trained = train_together(samples, &alone, &mut |epoch| {
+        let trained = train_together(samples, &alone, cancel, &mut |epoch| {
             progress(EpochProgress {
                 done: done + epoch.done,
                 epochs: config.charts * epochs,
@@ -277,6 +281,7 @@ pub fn train_further(
     samples: &Samples<f32>,
     start: &Mixture<f32>,
     config: &TrainConfig,
+    cancel: &Cancellation,
     progress: &mut dyn FnMut(EpochProgress),
 ) -> Result<Mixture<f32>, Error> {
     if start.chart_count() != 1 {
@@ -287,7 +292,14 @@ pub fn train_further(
 
     let mut random = Seeded::new(config.seed);
     if !config.standardise {
-        return fit(samples, start.clone(), config, &mut random, progress);
+        return fit(
+            samples,
+            start.clone(),
+            config,
+            &mut random,
+            cancel,
+            progress,
+        );
     }
 
     // The network takes raw features: it is converted for z-scored features, trained, and converted
@@ -296,7 +308,14 @@ pub fn train_further(
     let mut unfolded = start.clone();
     unfolded.unfold_standardisation(&mean, &deviation);
 
-    let mut network = fit(&standardised, unfolded, config, &mut random, progress)?;
+    let mut network = fit(
+        &standardised,
+        unfolded,
+        config,
+        &mut random,
+        cancel,
+        progress,
+    )?;
     network.fold_standardisation(&mean, &deviation);
     Ok(network)
 }
@@ -307,6 +326,7 @@ const MEMBER_SEED_STEP: u32 = 0x0100_0193;
 fn train_together(
     samples: &Samples<f32>,
     config: &TrainConfig,
+    cancel: &Cancellation,
     progress: &mut dyn FnMut(EpochProgress),
 ) -> Result<Mixture<f32>, Error> {
     let widths = Widths {
@@ -318,13 +338,13 @@ fn train_together(
     let mut random = Seeded::new(config.seed);
     let start = Mixture::random(widths, config.charts, &mut random);
     if !config.standardise {
-        return fit(samples, start, config, &mut random, progress);
+        return fit(samples, start, config, &mut random, cancel, progress);
     }
 
     // Train on z-scored features, then fold the scaling into the first layer, so that the network
     // takes raw features.
     let (standardised, [mean, deviation]) = samples.standardised();
-    let mut network = fit(&standardised, start, config, &mut random, progress)?;
+    let mut network = fit(&standardised, start, config, &mut random, cancel, progress)?;
     network.fold_standardisation(&mean, &deviation);
 
     Ok(network)

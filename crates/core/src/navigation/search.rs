@@ -50,6 +50,18 @@ pub enum IndexKind {
     Hnsw(HnswParameters),
 }
 
+impl IndexKind {
+    /// Approximate number of frames that one query compares in a room of `frame_count` frames.
+    pub fn comparisons(self, frame_count: usize) -> usize {
+        match self {
+            Self::Exact => frame_count,
+            // The number grows with the logarithm of the frame count; a thousand are typical.
+            #[cfg(feature = "hnsw")]
+            Self::Hnsw(_) => frame_count.min(1_000),
+        }
+    }
+}
+
 /// A linear map of latents that turns the metric into Euclidean distance.
 #[derive(Debug, Clone)]
 struct Projection {

@@ -6,6 +6,7 @@ use crate::adapter::{
     self, Adapter, CorrectorKind, EpochProgress, MAX_CHARTS, Mixing, PairPlan, Preset, Samples,
     TrainConfig, TrainingRecord, train, train_corrector,
 };
+use crate::cancel::Cancellation;
 use crate::features::Features;
 use crate::geometry::{Pose, Twist, body_twist};
 use crate::motion_scores::{MotionScores, constant_r2};
@@ -242,7 +243,8 @@ pub fn train_adapter(
     let tests = test_pairs(room_data, plan)?;
     let samples = samples(room_data, plan)?;
     let trained_with = plan.config_for(samples.pair_count());
-    let network = train(&samples, &trained_with, progress)?;
+    let cancel = Cancellation::default();
+    let network = train(&samples, &trained_with, &cancel, progress)?;
     let adapter = Adapter::new(
         room_data[0].features.source().clone(),
         network,

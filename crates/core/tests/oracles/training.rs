@@ -7,6 +7,7 @@ use seese3_core::adapter::{
     Adapter, Error, Loss, Mixing, Mixture, Network, Real, Samples, Siamese, TENSOR_NAMES,
     TrainConfig, Trainer, Widths, train,
 };
+use seese3_core::cancel::Cancellation;
 use seese3_core::features::FeatureSource;
 use seese3_core::room::Timeline;
 use seese3_core::splits::{Pair, Split};
@@ -279,9 +280,9 @@ fn an_ensembles_members_are_adapters_learned_alone() {
         mixing: Mixing::Even,
         ..alone.clone()
     };
-    let ensemble = train(&samples, &together, &mut |_| ()).unwrap();
+    let ensemble = train(&samples, &together, &Cancellation::default(), &mut |_| ()).unwrap();
 
-    let first = train(&samples, &alone, &mut |_| ()).unwrap();
+    let first = train(&samples, &alone, &Cancellation::default(), &mut |_| ()).unwrap();
     assert_eq!(ensemble.chart_count(), 3);
     assert_eq!(ensemble.charts()[0], first.charts()[0]);
     assert_ne!(ensemble.charts()[1], ensemble.charts()[0]);
@@ -293,7 +294,7 @@ fn an_ensembles_members_are_adapters_learned_alone() {
     };
 
     assert!(matches!(
-        train(&samples, &refused, &mut |_| ()),
+        train(&samples, &refused, &Cancellation::default(), &mut |_| ()),
         Err(Error::GatedStandardised)
     ));
 }
@@ -319,7 +320,7 @@ fn weights_learned_on_z_scored_features_are_folded() {
     };
     let learned = |rows: &Array2<f32>, config: &TrainConfig| {
         let samples = Samples::<f32>::new(rows.view(), poses.clone(), pairs.clone()).unwrap();
-        train(&samples, config, &mut |_| ()).unwrap()
+        train(&samples, config, &Cancellation::default(), &mut |_| ()).unwrap()
     };
 
     let expected = learned(&scored, &config).embed(scored.clone());
@@ -345,13 +346,13 @@ fn averaged_weights_lie_between_start_and_end() {
         batch: 1_000,
         ..TrainConfig::default()
     };
-    let last = train(&samples, &one_step, &mut |_| ()).unwrap();
+    let last = train(&samples, &one_step, &Cancellation::default(), &mut |_| ()).unwrap();
 
     let averaging = TrainConfig {
         average: 0.9,
         ..one_step
     };
-    let averaged = train(&samples, &averaging, &mut |_| ()).unwrap();
+    let averaged = train(&samples, &averaging, &Cancellation::default(), &mut |_| ()).unwrap();
 
     let widths = Widths {
         feature: samples.feature_dim(),

@@ -236,8 +236,11 @@ fn first_reason(dropped: &[Dropped]) -> String {
     })
 }
 
+/// Maximum size of a file that is read as a whole, bytes.
+const MAX_FILE_BYTES: u64 = 8 << 30;
+
 fn read_bytes(file: &Path) -> Result<Vec<u8>, Error> {
-    std::fs::read(file).map_err(|cause| Error::Io {
+    seese3_files::read(file, MAX_FILE_BYTES).map_err(|cause| Error::Io {
         file: file.to_owned(),
         cause,
     })

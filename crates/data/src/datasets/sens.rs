@@ -111,7 +111,7 @@ impl<'a> Sens<'a> {
             file: path.to_owned(),
             cause,
         };
-        let file = File::open(path).map_err(io)?;
+        let file = seese3_files::open(path).map_err(io)?;
         let size = file.metadata().map_err(io)?.len();
 
         Ok(Self {

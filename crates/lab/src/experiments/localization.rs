@@ -5,12 +5,15 @@ use std::sync::Arc;
 use serde::Serialize;
 
 use seese3_core::adapter::{Adapter, EpochProgress};
+use seese3_core::cancel::Cancellation;
 use seese3_core::geometry::{Pose, PoseError, exp, log};
 use seese3_core::room::FrameId;
 use seese3_core::splits::is_in_left_out_block;
 use seese3_core::statistics::{Coverage, RecordedMedian, coverage, median_of_recording, quantile};
 use seese3_core::training::RoomData;
-use seese3_robot::fitting::{Fitted, Localizer, MotionHypotheses, MotionReader, ReadingRules, fit};
+use seese3_robot::fitting::{
+    FitRun, Fitted, Localizer, MotionHypotheses, MotionReader, ReadingRules, fit,
+};
 
 use super::Error;
 
@@ -159,7 +162,14 @@ pub fn evaluate(
     }
 
     let fitted = fit_adapter
-        .then(|| fit(data, &mapped, adapter, protocol.seed, progress))
+        .then(|| {
+            let cancel = Cancellation::default();
+            let run = FitRun {
+                progress,
+                cancel: &cancel,
+            };
+            fit(data, &mapped, adapter, protocol.seed, run)
+        })
         .transpose()?;
     let network = fitted.as_ref().map(|fitted| fitted.adapter.clone());
     let localizer = Localizer::new(data, &mapped, adapter.cloned(), network)?;

@@ -11,7 +11,7 @@ use seese3_core::navigation::{IndexKind, Navigator, Pursuit};
 use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::HoldOut;
 use seese3_core::training::RoomData;
-use seese3_robot::fitting::{RoomReader, fit};
+use seese3_robot::fitting::{FitRun, RoomReader, fit};
 use seese3_robot::planning::{Hops, LEAST_ARRIVAL_PROBABILITY, Route, RouteBounds};
 use seese3_robot::tracking::Map;
 
@@ -112,7 +112,7 @@ impl MappedRoom {
                 features: &features,
             };
             let mapped = all_frames(&navigator);
-            let fitted = fit(&data, &mapped, Some(adapter), 0, &|_| ()).within(what)?;
+            let fitted = fit(&data, &mapped, Some(adapter), 0, FitRun::UNWATCHED).within(what)?;
             let reader = RoomReader::new(&data, &mapped, Some(adapter.clone()), &fitted);
             Some(reader.within(what)?)
         } else {

@@ -12,7 +12,7 @@ use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::HoldOut;
 use seese3_core::training::RoomData;
 use seese3_core::trajectory::Trajectory;
-use seese3_robot::fitting::{RoomReader, fit};
+use seese3_robot::fitting::{FitRun, RoomReader, fit};
 use seese3_robot::front_end::{FrontEnd, RetrievalFrontEnd, StreamCamera};
 use seese3_robot::localization::KeypointRoom;
 use seese3_robot::pose_filter::{FilterParameters, FilterRoom, PoseFilter, ViewObservation};
@@ -155,7 +155,7 @@ impl<'a> TrackedRoom<'a> {
         let map = Map::new(Arc::new(navigator), &mapped).within(what)?;
         let mut map = map.with_features(data.features.rows(), &mapped);
         if protocol.is_fitted {
-            let fitted = fit(data, &mapped, Some(adapter), 0, &|_| ()).within(what)?;
+            let fitted = fit(data, &mapped, Some(adapter), 0, FitRun::UNWATCHED).within(what)?;
             let reader = RoomReader::new(data, &mapped, Some(adapter.clone()), &fitted);
             map = map.with_pose_reader(Arc::new(reader.within(what)?));
         }

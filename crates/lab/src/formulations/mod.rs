@@ -23,6 +23,7 @@ use strum::{IntoStaticStr, VariantArray};
 
 use seese3_core::adapter::building_blocks::{Seeded, fit};
 use seese3_core::adapter::{EpochProgress, Objective, Samples, TargetScale, TrainConfig, Widths};
+use seese3_core::cancel::Cancellation;
 use seese3_core::geometry::{Pose, Twist, log};
 use seese3_core::motion_scores::ReadMotions;
 use seese3_core::splits::Pair;
@@ -202,7 +203,14 @@ impl Run<'_> {
         progress: &mut dyn FnMut(EpochProgress),
         predict: impl Fn(&N, Ends<'_>) -> Vec<Twist>,
     ) -> Result<Vec<ReadMotions>, training::Error> {
-        let network = fit(self.samples, start, self.config, random, progress)?;
+        let network = fit(
+            self.samples,
+            start,
+            self.config,
+            random,
+            &Cancellation::default(),
+            progress,
+        )?;
         let read = |(data, pairs): (&RoomData<'_>, &Vec<Pair>)| {
             let rows = |end: fn(&Pair) -> usize| {
                 let rows: Vec<usize> = pairs.iter().map(end).collect();

@@ -11,6 +11,7 @@ use seese3_core::adapter::{
     self, Adapter, EpochProgress, PairPlan, Samples, TrainConfig, TrainingRecord, train,
     train_further,
 };
+use seese3_core::cancel::Cancellation;
 use seese3_core::geometry::{Twist, body_twist};
 use seese3_core::motion_scores::{MotionScores, constant_r2};
 use seese3_core::room::FrameId;
@@ -38,24 +39,45 @@ pub struct Fitted {
     pub record: TrainingRecord,
 }
 
+/// How a fit reports its progress and is stopped.
+#[derive(Clone, Copy)]
+pub struct FitRun<'a> {
+    /// Called after each epoch, [`FITTING_EPOCHS`] times in all, from several threads.
+    pub progress: &'a (dyn Fn(EpochProgress) + Sync),
+    /// Stops the fit.
+    pub cancel: &'a Cancellation,
+}
+
+/// Never set.
+static NEVER: Cancellation = Cancellation::new();
+
+impl FitRun<'static> {
+    /// A run without progress that cannot be stopped.
+    pub const UNWATCHED: Self = Self {
+        progress: &|_| (),
+        cancel: &NEVER,
+    };
+}
+
 /// Fits an adapter to the mapped frames of a room; `mapped` must be in ascending order.
 ///
 /// Training continues from the weights of `base`, an adapter of other rooms, if that has one chart;
 /// otherwise it starts from new weights. `base` also remains a motion estimator of its own, see
-/// [`ReadingRules`]. `progress` is called once per epoch; five models are trained in parallel.
+/// [`ReadingRules`]. Five models are trained in parallel.
 ///
 /// # Errors
 /// - [`Error::FewFrames`] or [`Error::MappedFrames`] for invalid mapped frames.
 /// - [`Error::Training`] if features and room do not match.
 /// - [`Error::Adapter`] if `base` has another feature source or training fails, for example because
 ///   the camera does not move.
+/// - [`Error::Adapter`] with `Cancelled` once `run.cancel` is set.
 /// - [`Error::AllAlike`] if the features of the mapped frames are identical.
 pub fn fit(
     data: &RoomData<'_>,
     mapped: &[FrameId],
     base: Option<&Arc<Adapter>>,
     seed: u64,
-    progress: &(dyn Fn(EpochProgress) + Sync),
+    run: FitRun<'_>,
 ) -> Result<Fitted, Error> {
     check_rooms(std::slice::from_ref(data))?;
     check_mapped(data.room, mapped, FEWEST_MAPPED_FRAMES)?;
@@ -65,13 +87,13 @@ pub fn fit(
 
     // The adapter and the models of the folds are independent: train them in parallel.
     let folds = folds(mapped);
-    let tried = |fold: &Fold| trials(data, fold, base, seed, progress);
+    let tried = |fold: &Fold| trials(data, fold, base, seed, run);
     let (trained, tried) = std::thread::scope(|scope| {
         let tried: Vec<_> = folds
             .iter()
             .map(|fold| scope.spawn(|| tried(fold)))
             .collect();
-        let trained = trained(data, mapped, base, seed, progress);
+        let trained = trained(data, mapped, base, seed, run);
 
         let tried: Vec<_> = tried
             .into_iter()
@@ -120,7 +142,7 @@ fn trained(
     mapped: &[FrameId],
     base: Option<&Arc<Adapter>>,
     seed: u64,
-    progress: &(dyn Fn(EpochProgress) + Sync),
+    run: FitRun<'_>,
 ) -> Result<(Adapter, Samples<f32>), Error> {
     let samples = Samples::new(
         data.features.rows(),
@@ -129,17 +151,21 @@ fn trained(
     )?;
 
     let config = config(seed);
-    let mut progress = |epoch| progress(epoch);
+    let mut progress = |epoch| (run.progress)(epoch);
     let base = base.filter(|base| base.network().chart_count() == 1);
     let (network, samples) = match base {
         Some(base) => {
             let samples = samples.with_scale(base.scale().clone())?;
-            let network = train_further(&samples, base.network(), &config, &mut progress)?;
+            let network =
+                train_further(&samples, base.network(), &config, run.cancel, &mut progress)?;
             (network, samples)
         }
         None => {
             let samples = samples.through_zero()?;
-            (train(&samples, &config, &mut progress)?, samples)
+            (
+                train(&samples, &config, run.cancel, &mut progress)?,
+                samples,
+            )
         }
     };
 
@@ -154,9 +180,9 @@ fn trials(
     fold: &Fold,
     base: Option<&Arc<Adapter>>,
     seed: u64,
-    progress: &(dyn Fn(EpochProgress) + Sync),
+    run: FitRun<'_>,
 ) -> Result<Vec<HeldOutView>, Error> {
-    let (adapter, _) = trained(data, &fold.mapped, base, seed, progress)?;
+    let (adapter, _) = trained(data, &fold.mapped, base, seed, run)?;
     let localizer = Localizer::new(data, &fold.mapped, base.cloned(), Some(Arc::new(adapter)))?;
 
     fold.left_out

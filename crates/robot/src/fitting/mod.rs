@@ -21,7 +21,7 @@ mod hypotheses;
 mod room_reader;
 mod rules;
 
-pub use fit::{FEWEST_MAPPED_FRAMES, FITTED_PRESET, FITTING_EPOCHS, Fitted, fit};
+pub use fit::{FEWEST_MAPPED_FRAMES, FITTED_PRESET, FITTING_EPOCHS, FitRun, Fitted, fit};
 pub use hypotheses::{MotionHypotheses, MotionReader, PartRule};
 pub use localizer::{Localizer, LocatedView};
 pub use room_reader::RoomReader;

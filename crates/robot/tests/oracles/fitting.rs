@@ -9,7 +9,7 @@ use seese3_core::geometry::PoseError;
 use seese3_core::room::{FrameId, Room};
 use seese3_core::statistics::{coverage, median};
 use seese3_core::training::RoomData;
-use seese3_robot::fitting::{Error, Fitted, Localizer, MotionReader, fit};
+use seese3_robot::fitting::{Error, FitRun, Fitted, Localizer, MotionReader, fit};
 
 use seese3_testing::world::{calibrated, place, served};
 
@@ -30,7 +30,14 @@ fn data<'a>(room: &'a Room, features: &'a Features) -> RoomData<'a> {
 }
 
 fn fitted(room: &Room, features: &Features, base: Option<&Arc<Adapter>>) -> Fitted {
-    fit(&data(room, features), &every_tenth(room), base, 0, &|_| ()).unwrap()
+    fit(
+        &data(room, features),
+        &every_tenth(room),
+        base,
+        0,
+        FitRun::UNWATCHED,
+    )
+    .unwrap()
 }
 
 /// Oracle: the true poses of the frames that are not mapped, which the fit never saw, and the pose
@@ -134,7 +141,7 @@ fn the_same_seed_fits_the_same_adapter() {
 fn what_cannot_be_fitted_is_refused() {
     let (room, features) = served("hall");
     let data = data(&room, &features);
-    let try_fit = |mapped: &[FrameId]| fit(&data, mapped, None, 0, &|_| ()).map(|_| ());
+    let try_fit = |mapped: &[FrameId]| fit(&data, mapped, None, 0, FitRun::UNWATCHED).map(|_| ());
 
     let few: Vec<FrameId> = (0..19).map(FrameId).collect();
     assert_eq!(
@@ -165,5 +172,5 @@ fn what_cannot_be_fitted_is_refused() {
         room: &unmoved,
         ..data
     };
-    assert!(fit(&unmoved, &mapped, None, 0, &|_| ()).is_err());
+    assert!(fit(&unmoved, &mapped, None, 0, FitRun::UNWATCHED).is_err());
 }

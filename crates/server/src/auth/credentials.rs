@@ -26,9 +26,10 @@ use subtle::ConstantTimeEq;
 use tokio::sync::watch;
 
 use super::super::Error;
+use super::super::slow_files::read_within_limit;
 use super::issuer_form::IssuerForm;
 use super::issuers::Issuer;
-use super::{Principal, Rights, RoomScope, Signed, Verb};
+use super::{MAX_FILE_BYTES, Principal, Rights, RoomScope, Signed, Verb};
 
 /// Polling interval of the file.
 const LOOK: Duration = Duration::from_secs(5);
@@ -114,9 +115,11 @@ impl Credentials {
     /// [`AuthError`], which names the principal or issuer and the key. A file without principals
     /// and issuers is rejected: it would lock out every caller.
     pub fn read(file: &Path) -> Result<Self, AuthError> {
-        let text = std::fs::read_to_string(file).map_err(|problem| AuthError::Unreadable {
-            file: file.to_owned(),
-            problem,
+        let text = seese3_files::read_text(file, MAX_FILE_BYTES).map_err(|problem| {
+            AuthError::Unreadable {
+                file: file.to_owned(),
+                problem,
+            }
         })?;
 
         Self::of(file, &text)
@@ -334,7 +337,7 @@ fn rights(
     Ok(Rights {
         streams: limit("streams", streams, MOST_STREAMS)?,
         requests: limit("requests", requests, MOST_REQUESTS)?,
-        name,
+        name: name.into(),
         verbs,
         rooms: RoomScope(vec![rooms]),
     })
@@ -391,15 +394,12 @@ impl Keyring {
     /// Polls the file for changes; never completes. An invalid file is logged, and the current
     /// credentials stay in effect.
     pub async fn follow_file(&self) {
-        // Blocking thread: a hanging file system must not block anything else.
-        let read = || {
-            let file = self.file.clone();
-            tokio::task::spawn_blocking(move || Credentials::read(&file))
-        };
         let mut trouble = String::new();
 
         loop {
-            let Ok(credentials) = read().await else {
+            let file = self.file.clone();
+            let credentials = read_within_limit("--auth-file", move || Credentials::read(&file));
+            let Ok(credentials) = credentials.await else {
                 return;
             };
             match credentials {

@@ -25,7 +25,7 @@ use std::time::{Duration, SystemTime};
 use super::super::Error;
 use super::issuer_form::{IssuerForm, LEEWAY_S};
 use super::signed_tokens::{Claims, PublicKey};
-use super::{Places, Principal, Rights, RoomScope, Signed, Verb};
+use super::{MAX_FILE_BYTES, Places, Principal, Rights, RoomScope, Signed, Verb};
 
 /// Maximum length of a subject name, characters.
 const LONGEST_SUBJECT: usize = 200;
@@ -69,7 +69,7 @@ impl Issuer {
         let mut keys = Vec::new();
         for name in &form.public_keys {
             let unfit = |problem: String| format!("public_keys: {name}: {problem}");
-            let pem = std::fs::read(folder.join(name))
+            let pem = seese3_files::read(&folder.join(name), MAX_FILE_BYTES)
                 .map_err(|error| unfit(format!("cannot be read: {error}")))?;
             let key = PublicKey::new(&pem, &form).map_err(unfit)?;
             pems.push(pem);
@@ -137,7 +137,7 @@ impl Issuer {
             words.is_none_or(|mut words| words.any(|word| word == <&str>::from(*verb)))
         };
         let rights = Rights {
-            name: format!("{sub}@{}", self.form.issuer),
+            name: format!("{sub}@{}", self.form.issuer).into(),
             verbs: self.rights.verbs.iter().filter(in_scope).copied().collect(),
             rooms: match seese3_rooms {
                 Some(rooms) => self.rights.rooms.and(rooms),

@@ -13,15 +13,18 @@ use tower::{Layer, Service};
 
 use super::super::Error;
 use super::super::connections::Peer;
+use super::super::health::{HEALTH_CHECK, HEALTH_WATCH};
 use super::super::holding_body::holding;
 use super::super::metrics::Metrics;
+use super::super::rpcs::rpc;
 use super::super::status::Full;
 use super::{Keyring, Principal, Verb};
 
 /// The verb that an RPC requires, by path prefix; the first match counts.
-const VERBS: [(&str, Need); 9] = [
+const VERBS: [(&str, Need); 10] = [
     // Container and load balancer probes have no token.
-    ("/grpc.health.v1.Health/", Need::Nothing),
+    (HEALTH_CHECK, Need::Nothing),
+    (HEALTH_WATCH, Need::Nothing),
     ("/grpc.reflection.", Need::Verb(Verb::Catalog)),
     ("/seese3.v1.NavigationService/", Need::Verb(Verb::Navigate)),
     (
@@ -116,27 +119,31 @@ impl AuthLayer {
     /// Authenticates and authorizes a request, and stores its principal in the request's
     /// extensions. `None` if the RPC or the server requires no authentication.
     fn admit<B>(&self, request: &mut Request<B>) -> Result<Option<Admitted>, Error> {
+        let path = request.uri().path();
+        let is_known = rpc(path).is_some();
         let Some(keyring) = &self.keyring else {
-            return Ok(None);
+            return is_known.then_some(None).ok_or(Error::UnknownPath);
         };
 
-        let path = request.uri().path();
-        let need = VERBS
-            .iter()
-            .find(|(beginning, _)| path.starts_with(beginning));
+        let mut needs = VERBS.iter();
+        let need = needs.find(|(beginning, _)| path.starts_with(beginning));
         let verb = match need {
-            Some((_, Need::Nothing)) => return Ok(None),
+            Some((_, Need::Nothing)) if is_known => return Ok(None),
             Some((_, Need::Verb(verb))) => Some(*verb),
-            // A path without a row needs no verb; every service that is registered must have a row.
-            // On an unknown path, authenticated callers get "unimplemented", others
-            // "unauthenticated".
-            None => None,
+            Some((_, Need::Nothing)) | None => None,
         };
 
         let principal = caller(keyring, request)?;
         tracing::Span::current().record("principal", principal.name());
 
-        if let Some(verb) = verb.filter(|&verb| !principal.may(verb)) {
+        // Without credentials, all unknown paths are refused above as unauthenticated.
+        if !is_known {
+            return Err(Error::UnknownPath);
+        }
+
+        // An RPC without a verb is refused, so that a new service cannot be open by mistake.
+        let verb = verb.ok_or(Error::UnknownPath)?;
+        if !principal.may(verb) {
             return Err(Error::Forbidden { verb: verb.into() });
         }
 

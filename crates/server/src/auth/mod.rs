@@ -26,6 +26,9 @@ use serde::Deserialize;
 use strum::IntoStaticStr;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
+/// Maximum size of the auth file, or of a key file, bytes.
+const MAX_FILE_BYTES: u64 = 16 << 20;
+
 /// The permission that an RPC requires; each RPC requires one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, IntoStaticStr)]
 #[serde(rename_all = "lowercase")]
@@ -70,7 +73,7 @@ impl RoomScope {
 /// The rights of a caller.
 #[derive(Debug, PartialEq, Eq)]
 struct Rights {
-    name: String,
+    name: Arc<str>,
     verbs: Vec<Verb>,
     rooms: RoomScope,
     /// Maximum number of concurrent Track streams.
@@ -124,6 +127,11 @@ impl Principal {
     /// The caller's name, for the log.
     pub fn name(&self) -> &str {
         &self.rights.name
+    }
+
+    /// The caller's name, shared.
+    pub fn shared_name(&self) -> Arc<str> {
+        self.rights.name.clone()
     }
 
     /// The rooms that it may access.

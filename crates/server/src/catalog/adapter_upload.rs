@@ -1,11 +1,9 @@
 //! Adapter uploads.
 
-use std::sync::Arc;
-
 use prost::Message;
 use tonic::Streaming;
 
-use super::super::auth::Principal;
+use super::super::caller::Requester;
 use super::super::{Error, Handlers};
 use super::changes::{check_right, identity, named_whole, revision_to_wire};
 use super::room_upload::{expect_end, next};
@@ -16,7 +14,7 @@ impl Handlers {
     /// Receives an adapter and publishes it.
     pub(super) async fn receive_adapter(
         &self,
-        caller: Option<Arc<Principal>>,
+        caller: Requester,
         mut messages: Streaming<pb::PublishAdapterRequest>,
     ) -> Result<pb::PublishAdapterResponse, Error> {
         use pb::publish_adapter_request::Message as Wire;
@@ -32,12 +30,12 @@ impl Handlers {
 
         let name = named_whole("name", &upload.name, Kind::Adapter);
         let name = name.map_err(|error| error.within("adapter"))?;
-        check_right(caller.as_ref(), &name)?;
+        check_right(&caller, &name)?;
 
         // The manifest states the size of the weights, so no more memory is reserved or accepted.
         let size = seese3_store::stated_weights_size(&upload.manifest).map_err(unfit)?;
         let size = usize::try_from(size).unwrap_or(usize::MAX);
-        let memory = changes.upload_memory(size)?;
+        let memory = changes.upload_memory(&caller.id, size)?;
         let weights = weights(&mut messages, size).await?;
 
         // Loading verifies that the weights reproduce their golden outputs on this machine.
@@ -51,12 +49,7 @@ impl Handlers {
         }
 
         let content = upload.encode_to_vec();
-        let identity = identity(
-            caller.as_ref(),
-            &upload.request_id,
-            "PublishAdapter",
-            &content,
-        );
+        let identity = identity(&caller, &upload.request_id, "PublishAdapter", &content);
         let store = changes.store.clone();
         let published_as = name.name.clone();
         let change = async move {

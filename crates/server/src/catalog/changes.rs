@@ -1,17 +1,19 @@
 //! Common steps of all catalog changes: authorization, stored responses for retries, one change at
 //! a time, and a reload of the store afterwards.
 
+use std::collections::BTreeSet;
 use std::future::Future;
-use std::sync::Arc;
+use std::sync::{self, Arc, PoisonError};
 
 use prost::Message;
 use sha2::{Digest, Sha256};
-use tokio::sync::{Mutex, OwnedSemaphorePermit, Semaphore};
+use tokio::sync::Mutex;
 use tracing::Instrument;
 
-use super::super::auth::Principal;
+use super::super::caller::{CallerId, Requester};
 use super::super::metrics::Metrics;
 use super::super::reload::ReloadHandle;
+use super::super::shares::{Exhausted, Share, Shares};
 use super::super::snapshot::Snapshot;
 use super::super::status::Full;
 use super::super::{Config, Error, Handlers, Phase};
@@ -20,8 +22,6 @@ use seese3_client::proto::v1 as pb;
 use seese3_store::fit_stored_room;
 use seese3_store::{Kind, Published, ResourceName, Store};
 
-/// Unit of upload memory, bytes.
-const PIECE: usize = 1_024;
 /// Maximum length of free-text fields, characters.
 const LONGEST_WORDS: usize = 1_000;
 /// Maximum number of queued or running changes.
@@ -32,12 +32,12 @@ pub struct Changes {
     pub store: Store,
     reload: ReloadHandle,
     recent: Arc<Mutex<Recent>>,
-    /// Permits of queued and running changes.
-    waiting: Arc<Semaphore>,
-    /// Memory limit of all uploads together, in units of [`PIECE`].
-    upload_pieces: usize,
-    uploads: Arc<Semaphore>,
-    fits: Arc<Semaphore>,
+    /// Places of queued and running changes.
+    waiting: Arc<Shares>,
+    /// Memory of all uploads, bytes.
+    uploads: Arc<Shares>,
+    /// Callers with a fit that is queued or runs.
+    fits: Arc<sync::Mutex<BTreeSet<CallerId>>>,
     metrics: Metrics,
 }
 
@@ -47,11 +47,9 @@ impl Changes {
             store,
             reload,
             recent: Arc::default(),
-            waiting: Arc::new(Semaphore::new(MOST_WAITING)),
-            upload_pieces: config.upload_bytes / PIECE,
-            uploads: Arc::new(Semaphore::new(config.upload_bytes / PIECE)),
-            // One at a time, because a fit uses all processors.
-            fits: Arc::new(Semaphore::new(1)),
+            waiting: Shares::new(MOST_WAITING),
+            uploads: Shares::new(config.upload_bytes),
+            fits: Arc::default(),
             metrics: config.metrics.clone(),
         }
     }
@@ -69,12 +67,12 @@ impl Changes {
         change: impl Future<Output = Result<T, Error>> + Send + 'static,
         answer: impl FnOnce(T) -> A + Send + 'static,
     ) -> Result<A, Error> {
-        let waiting = self.waiting.clone().try_acquire_owned();
-        let waiting = waiting.map_err(|_| {
-            self.metrics.shed(Full::Changes);
-            Error::Full {
-                what: Full::Changes,
-            }
+        let waiting = self.waiting.take(identity.charged.clone(), 1);
+        let waiting = waiting.map_err(|limit| {
+            self.full(match limit {
+                Exhausted::Budget => Full::Changes,
+                Exhausted::Share => Full::CallersChanges,
+            })
         })?;
 
         let changes = self.clone();
@@ -117,32 +115,58 @@ impl Changes {
         decoded.map_err(|_| Error::Internal)
     }
 
-    /// Reserves memory for a part of an upload; it is released when the permit is dropped.
+    /// Reserves memory for a part of an upload; it is released when the share is dropped.
     ///
     /// # Errors
-    /// [`Error::Invalid`] if it exceeds the limit of all uploads together, [`Error::Full`] if the
+    /// [`Error::Invalid`] if it exceeds the largest share of one caller, [`Error::Full`] if the
     /// uploads in progress leave too little.
-    pub fn upload_memory(&self, bytes: usize) -> Result<OwnedSemaphorePermit, Error> {
-        let pieces = bytes.div_ceil(PIECE);
-        if pieces > self.upload_pieces {
-            let problem =
-                "exceeds the memory limit of all uploads; the operator sets --max-upload-bytes";
+    pub fn upload_memory(&self, caller: &CallerId, bytes: usize) -> Result<Share, Error> {
+        if bytes > self.uploads.budget().div_ceil(2) {
+            let problem = "exceeds the memory limit of an upload, half of --max-upload-bytes; the operator \
+                           sets it";
             return Err(Error::invalid("message", problem));
         }
 
-        let pieces = u32::try_from(pieces).unwrap_or(u32::MAX);
-        let memory = self.uploads.clone().try_acquire_many_owned(pieces);
-        memory.map_err(|_| {
-            self.metrics.shed(Full::Uploads);
-            Error::Full {
-                what: Full::Uploads,
-            }
+        let memory = self.uploads.take(caller.clone(), bytes);
+        memory.map_err(|limit| {
+            self.full(match limit {
+                Exhausted::Budget => Full::Uploads,
+                Exhausted::Share => Full::CallersUploads,
+            })
         })
     }
 
-    /// The permit for a fit; `None` if one is running.
-    pub fn fit_place(&self) -> Option<OwnedSemaphorePermit> {
-        self.fits.clone().try_acquire_owned().ok()
+    /// The place of a caller's fit.
+    ///
+    /// # Errors
+    /// [`Error::Full`] if the caller has a fit that is queued or runs.
+    pub fn fit_place(&self, caller: &CallerId) -> Result<FitPlace, Error> {
+        let mut fits = self.fits.lock().unwrap_or_else(PoisonError::into_inner);
+        if !fits.insert(caller.clone()) {
+            return Err(self.full(Full::CallersFits));
+        }
+        Ok(FitPlace {
+            caller: caller.clone(),
+            fits: self.fits.clone(),
+        })
+    }
+
+    fn full(&self, what: Full) -> Error {
+        self.metrics.shed(what);
+        Error::Full { what }
+    }
+}
+
+/// The place of a caller's only fit, free again when dropped.
+pub struct FitPlace {
+    caller: CallerId,
+    fits: Arc<sync::Mutex<BTreeSet<CallerId>>>,
+}
+
+impl Drop for FitPlace {
+    fn drop(&mut self) {
+        let mut fits = self.fits.lock().unwrap_or_else(PoisonError::into_inner);
+        fits.remove(&self.caller);
     }
 }
 
@@ -177,6 +201,19 @@ impl Handlers {
                     .to_owned(),
             )
         })
+    }
+
+    /// The snapshot of the store as it is now, limited to the rooms that the caller may see: another
+    /// program may have published an adapter that the caller names.
+    ///
+    /// # Errors
+    /// As [`Handlers::changes`].
+    pub(super) async fn reloaded<T>(
+        &self,
+        request: &tonic::Request<T>,
+    ) -> Result<Arc<Snapshot>, Error> {
+        self.changes()?.reload.now().await;
+        self.snapshot(request)
     }
 
     /// Whether a room is currently served with this revision of an adapter.
@@ -215,19 +252,15 @@ impl Handlers {
 }
 
 /// The identity of a change. `method` distinguishes RPCs with equal content.
-pub fn identity(
-    caller: Option<&Arc<Principal>>,
-    request_id: &str,
-    method: &str,
-    content: &[u8],
-) -> Identity {
+pub fn identity(caller: &Requester, request_id: &str, method: &str, content: &[u8]) -> Identity {
     let mut digest = Sha256::new();
     digest.update(method);
     digest.update([0]);
     digest.update(content);
 
     Identity {
-        caller: caller.map_or_else(String::new, |caller| caller.name().to_owned()),
+        caller: caller.name().to_owned(),
+        charged: caller.id.clone(),
         request_id: request_id.to_owned(),
         content: digest.finalize().into(),
     }
@@ -278,8 +311,8 @@ pub fn check_length(field: &str, words: &str) -> Result<(), Error> {
 ///
 /// # Errors
 /// [`Error::OutOfScope`] if not.
-pub fn check_right(caller: Option<&Arc<Principal>>, resource: &ResourceName) -> Result<(), Error> {
-    let Some(scope) = caller.map(|caller| caller.rooms()) else {
+pub fn check_right(caller: &Requester, resource: &ResourceName) -> Result<(), Error> {
+    let Some(scope) = caller.scope() else {
         return Ok(());
     };
 

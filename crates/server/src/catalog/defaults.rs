@@ -1,10 +1,10 @@
 //! Sets and rolls back defaults, and removes rooms, adapters and revisions.
 
-use std::sync::Arc;
-
 use prost::Message;
 
-use super::super::auth::{Principal, RoomScope};
+use super::super::auth::RoomScope;
+use super::super::caller::Requester;
+use super::super::snapshot::Snapshot;
 use super::super::{Error, Handlers};
 use super::changes::{check_right, identity, named, named_whole};
 use super::recent::Identity;
@@ -14,13 +14,14 @@ use seese3_store::{Choice, Defaults, Kind, ResourceName};
 impl Handlers {
     pub(super) async fn set(
         &self,
-        caller: Option<Arc<Principal>>,
+        caller: Requester,
+        snapshot: &Snapshot,
         request: pb::SetDefaultRequest,
     ) -> Result<pb::SetDefaultResponse, Error> {
         use pb::set_default_request::Default as Wire;
 
         let content = request.encode_to_vec();
-        let identity = identity(caller.as_ref(), &request.request_id, "SetDefault", &content);
+        let identity = identity(&caller, &request.request_id, "SetDefault", &content);
 
         // Destructured with no `..`, so that a new field breaks the build here.
         let pb::SetDefaultRequest {
@@ -33,7 +34,7 @@ impl Handlers {
         let resource: ResourceName = name
             .parse()
             .map_err(|error| Error::invalid("name", error))?;
-        check_right(caller.as_ref(), &resource)?;
+        check_right(&caller, &resource)?;
         if resource.revision.is_some() {
             let problem = "must not name a revision; give it as `revision`";
             return Err(Error::invalid("name", problem));
@@ -47,9 +48,11 @@ impl Handlers {
                     let problem = "is only for rooms";
                     return Err(Error::invalid("adapter", problem));
                 }
+                let adapter = named_whole("adapter", &adapter, Kind::Adapter)?.name;
+                check_default_adapter(snapshot, &resource.name, &adapter)?;
                 Choice::Adapter {
                     room: resource.name,
-                    adapter: named_whole("adapter", &adapter, Kind::Adapter)?.name,
+                    adapter,
                 }
             }
         };
@@ -58,37 +61,32 @@ impl Handlers {
         if validate_only {
             changes.store.check_choice(&choice).await?;
             let defaults = changes.store.defaults().await?;
-            let defaults = defaults_to_wire(&defaults, scope(caller.as_ref()));
+            let defaults = defaults_to_wire(&defaults, caller.scope());
             return Ok(pb::SetDefaultResponse { defaults });
         }
 
         let store = changes.store.clone();
         let change = async move { Ok(store.choose(&choice).await?) };
         let answer = move |defaults: Defaults| pb::SetDefaultResponse {
-            defaults: defaults_to_wire(&defaults, scope(caller.as_ref())),
+            defaults: defaults_to_wire(&defaults, caller.scope()),
         };
         changes.once(identity, change, answer).await
     }
 
     pub(super) async fn roll_back(
         &self,
-        caller: Option<Arc<Principal>>,
+        caller: Requester,
         request: pb::RollBackDefaultRequest,
     ) -> Result<pb::RollBackDefaultResponse, Error> {
         // The last change may concern any room.
-        if scope(caller.as_ref()).is_some_and(|scope| !scope.is_all()) {
+        if caller.scope().is_some_and(|scope| !scope.is_all()) {
             return Err(Error::OutOfScope {
                 what: "the defaults of all rooms",
             });
         }
 
         let content = request.encode_to_vec();
-        let identity = identity(
-            caller.as_ref(),
-            &request.request_id,
-            "RollBackDefault",
-            &content,
-        );
+        let identity = identity(&caller, &request.request_id, "RollBackDefault", &content);
         let changes = self.changes()?.clone();
         let store = changes.store.clone();
         let change = async move { Ok(store.take_back_choice().await?) };
@@ -100,13 +98,13 @@ impl Handlers {
 
     pub(super) async fn delete_room_named(
         &self,
-        caller: Option<Arc<Principal>>,
+        caller: Requester,
         request: pb::DeleteRoomRequest,
     ) -> Result<pb::DeleteRoomResponse, Error> {
         let content = request.encode_to_vec();
-        let identity = identity(caller.as_ref(), &request.request_id, "DeleteRoom", &content);
+        let identity = identity(&caller, &request.request_id, "DeleteRoom", &content);
         let resource = named("name", &request.name, Kind::Room)?;
-        check_right(caller.as_ref(), &resource)?;
+        check_right(&caller, &resource)?;
 
         let answer = |revisions| pb::DeleteRoomResponse { revisions };
         self.delete(identity, resource, request.validate_only, answer)
@@ -115,18 +113,13 @@ impl Handlers {
 
     pub(super) async fn delete_adapter_named(
         &self,
-        caller: Option<Arc<Principal>>,
+        caller: Requester,
         request: pb::DeleteAdapterRequest,
     ) -> Result<pb::DeleteAdapterResponse, Error> {
         let content = request.encode_to_vec();
-        let identity = identity(
-            caller.as_ref(),
-            &request.request_id,
-            "DeleteAdapter",
-            &content,
-        );
+        let identity = identity(&caller, &request.request_id, "DeleteAdapter", &content);
         let resource = named("name", &request.name, Kind::Adapter)?;
-        check_right(caller.as_ref(), &resource)?;
+        check_right(&caller, &resource)?;
 
         let answer = |revisions| pb::DeleteAdapterResponse { revisions };
         self.delete(identity, resource, request.validate_only, answer)
@@ -152,8 +145,27 @@ impl Handlers {
     }
 }
 
-fn scope(caller: Option<&Arc<Principal>>) -> Option<&RoomScope> {
-    caller.map(|caller| caller.rooms())
+/// Checks that the caller sees an adapter and that it can serve a room.
+///
+/// # Errors
+/// [`Error::NotFound`] if the adapter is not among those that the caller sees, whether it exists or
+/// not; [`Error::Invalid`] if it does not serve the room.
+fn check_default_adapter(snapshot: &Snapshot, room: &str, adapter: &str) -> Result<(), Error> {
+    snapshot.adapter(adapter)?;
+    let room = snapshot.room(room).map_err(|error| error.named("name"))?;
+    if room
+        .adapters()
+        .iter()
+        .any(|serving| serving.name == adapter)
+    {
+        return Ok(());
+    }
+
+    let problem = format!(
+        "does not serve rooms/{}: it is fitted to another room, or the room has no features of its source",
+        room.id
+    );
+    Err(Error::invalid("adapter", problem))
 }
 
 /// Converts the defaults within the caller's scope to the wire type.

@@ -6,8 +6,9 @@ use std::path::Path;
 use tonic::{Request, Response, Status};
 
 use super::super::convert;
+use super::super::cost::frame_bytes;
+use super::super::memory::hold_for_answer;
 use super::super::snapshot::Snapshot;
-use super::super::workers::Lane;
 use super::super::{Error, Handlers};
 use super::page_length;
 use seese3_client::proto::v1 as pb;
@@ -18,6 +19,9 @@ use seese3_robot::planning::PoseGraph;
 
 /// Maximum number of neighbors per frame.
 const MOST_NEIGHBOURS: usize = 32;
+
+/// Encoded size of a neighbor, at most, bytes.
+const NEIGHBOR_BYTES: usize = 80;
 
 /// Allowed thumbnail widths, pixels.
 const THUMBNAIL_WIDTHS: RangeInclusive<u32> = 16..=512;
@@ -35,12 +39,13 @@ impl Handlers {
             return Err(no_thumbnails("this server provides no thumbnails (--thumbnails)").into());
         }
 
-        let lane = if with_thumbnails {
-            Lane::Images
-        } else {
-            Lane::Short
-        };
-        self.unary(request, |_| lane, answer).await
+        let frames = page_length(request.get_ref().page_size)?;
+        self.unary(
+            request,
+            |costs, request| costs.list_frames(request, frames),
+            answer,
+        )
+        .await
     }
 }
 
@@ -79,6 +84,12 @@ fn answer(
     let all: Vec<FrameId> = (0..frame_count as u32).map(FrameId).collect();
     let graph = PoseGraph::new(room.poses(), &all);
     let last = first.saturating_add(length).min(frame_count);
+
+    let neighbors = match neighbours_within {
+        Some(_) => MOST_NEIGHBOURS * NEIGHBOR_BYTES,
+        None => 0,
+    };
+    hold_for_answer(last.saturating_sub(first) * (frame_bytes(room) + neighbors))?;
 
     let mut frames = Vec::new();
     let mut picture_bytes = 0;

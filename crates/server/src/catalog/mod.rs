@@ -31,6 +31,7 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 
 use super::auth::RoomScope;
+use super::caller::Requester;
 use super::convert;
 use super::memory::respond;
 use super::snapshot::{ServedRoom, Snapshot};
@@ -124,7 +125,7 @@ impl CatalogService for Handlers {
         request: Request<Streaming<pb::CreateRoomRequest>>,
     ) -> Result<Response<pb::CreateRoomResponse>, Status> {
         let snapshot = self.snapshot(&request)?;
-        let caller = principal(&request).cloned();
+        let caller = Requester::of(&request);
         let budget = self.workers.budget(request.metadata());
 
         let received = self.receive_room(caller, snapshot, request.into_inner());
@@ -136,7 +137,7 @@ impl CatalogService for Handlers {
         &self,
         request: Request<Streaming<pb::PublishAdapterRequest>>,
     ) -> Result<Response<pb::PublishAdapterResponse>, Status> {
-        let caller = principal(&request).cloned();
+        let caller = Requester::of(&request);
         let budget = self.workers.budget(request.metadata());
 
         let received = self.receive_adapter(caller, request.into_inner());
@@ -150,11 +151,13 @@ impl CatalogService for Handlers {
         &self,
         request: Request<pb::RefitRoomRequest>,
     ) -> Result<Response<Self::RefitRoomStream>, Status> {
-        let caller = principal(&request).cloned();
-        let admitted = self.admit_refit(caller.as_ref(), request.into_inner())?;
+        let caller = Requester::of(&request);
+        let context = self.workers.context(&request);
+        let snapshot = self.reloaded(&request).await?;
+        let admitted = self.admit_refit(&caller, &snapshot, request.into_inner())?;
 
         let (events, heard) = mpsc::channel(16);
-        tokio::spawn(self.clone().run_refit(admitted, events));
+        tokio::spawn(self.clone().run_refit(admitted, context, events));
         Ok(Response::new(ReceiverStream::new(heard)))
     }
 
@@ -162,15 +165,17 @@ impl CatalogService for Handlers {
         &self,
         request: Request<pb::SetDefaultRequest>,
     ) -> Result<Response<pb::SetDefaultResponse>, Status> {
-        let caller = principal(&request).cloned();
-        Ok(Response::new(self.set(caller, request.into_inner()).await?))
+        let caller = Requester::of(&request);
+        let snapshot = self.reloaded(&request).await?;
+        let answer = self.set(caller, &snapshot, request.into_inner()).await?;
+        Ok(Response::new(answer))
     }
 
     async fn roll_back_default(
         &self,
         request: Request<pb::RollBackDefaultRequest>,
     ) -> Result<Response<pb::RollBackDefaultResponse>, Status> {
-        let caller = principal(&request).cloned();
+        let caller = Requester::of(&request);
         let answer = self.roll_back(caller, request.into_inner()).await?;
         Ok(Response::new(answer))
     }
@@ -179,7 +184,7 @@ impl CatalogService for Handlers {
         &self,
         request: Request<pb::DeleteRoomRequest>,
     ) -> Result<Response<pb::DeleteRoomResponse>, Status> {
-        let caller = principal(&request).cloned();
+        let caller = Requester::of(&request);
         let answer = self.delete_room_named(caller, request.into_inner()).await?;
         Ok(Response::new(answer))
     }
@@ -188,7 +193,7 @@ impl CatalogService for Handlers {
         &self,
         request: Request<pb::DeleteAdapterRequest>,
     ) -> Result<Response<pb::DeleteAdapterResponse>, Status> {
-        let caller = principal(&request).cloned();
+        let caller = Requester::of(&request);
         let answer = self
             .delete_adapter_named(caller, request.into_inner())
             .await?;

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use super::super::Error;
+use super::super::caller::CallerId;
 
 /// Retention time of a response.
 const KEPT_FOR: Duration = Duration::from_secs(3_600);
@@ -18,6 +19,8 @@ const LONGEST_ID: usize = 100;
 pub struct Identity {
     /// The caller's name; empty without authentication.
     pub caller: String,
+    /// The caller that is charged for the change.
+    pub charged: CallerId,
     /// The caller's idempotency key; empty if it will not retry.
     pub request_id: String,
     /// SHA-256 of the request.
@@ -110,6 +113,7 @@ mod tests {
     fn identity(caller: &str, request_id: &str, content: u8) -> Identity {
         Identity {
             caller: caller.to_owned(),
+            charged: CallerId::Unknown,
             request_id: request_id.to_owned(),
             content: [content; 32],
         }

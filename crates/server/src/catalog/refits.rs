@@ -1,20 +1,23 @@
 //! Fits an adapter to a room on the server.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
 
 use prost::Message;
 use tokio::sync::mpsc;
 use tonic::Status;
 
-use super::super::auth::Principal;
-use super::super::status::Full;
-use super::super::workers::Lane;
+use super::super::auth::RoomScope;
+use super::super::caller::Requester;
+use super::super::snapshot::Snapshot;
+use super::super::workers::{CallContext, Lane};
 use super::super::{Error, Handlers};
 use super::changes::{check_right, identity, named_whole, revision_to_wire};
 use super::recent::Identity;
 use seese3_client::proto::v1 as pb;
-use seese3_robot::fitting::FITTING_EPOCHS;
+use seese3_core::adapter::EpochProgress;
+use seese3_core::cancel::Cancellation;
+use seese3_robot::fitting::{FITTING_EPOCHS, FitRun};
 use seese3_store::fit_stored_room::{Refit, Request};
 use seese3_store::{Kind, Published};
 
@@ -39,7 +42,8 @@ impl Handlers {
     /// room.
     pub(super) fn admit_refit(
         &self,
-        caller: Option<&Arc<Principal>>,
+        caller: &Requester,
+        snapshot: &Snapshot,
         request: pb::RefitRoomRequest,
     ) -> Result<Admitted, Error> {
         let content = request.encode_to_vec();
@@ -71,18 +75,25 @@ impl Handlers {
             }
         };
         let fitted_adapter = adapter("fitted_adapter", &fitted_adapter)?;
-        let is_of_room = |name: &String| name.starts_with(&format!("{}.", room.name));
-        let sees_all = caller.is_none_or(|caller| caller.rooms().is_all());
+        let base = adapter("base_adapter", &base_adapter)?;
+        if let Some(base) = &base {
+            // A hidden adapter is answered like a missing one.
+            let seen = snapshot.adapter(base);
+            seen.map_err(|error| error.named("base_adapter"))?;
+        }
+
+        let is_of_room = |name: &String| is_in_namespace(name, &room.name);
+        let sees_all = caller.scope().is_none_or(RoomScope::is_all);
         if !sees_all && !fitted_adapter.as_ref().is_none_or(is_of_room) {
             let problem = format!(
-                "must begin with '{}.' for a caller without access to all rooms",
-                room.name
+                "must be '{}.NAME' or '{}.NAME.NAME' for a caller without access to all rooms",
+                room.name, room.name
             );
             return Err(Error::invalid("fitted_adapter", problem));
         }
 
         let request = Request {
-            base: adapter("base_adapter", &base_adapter)?,
+            base,
             name: fitted_adapter,
             features: (!features.is_empty()).then_some(features),
             room: room.name,
@@ -96,9 +107,16 @@ impl Handlers {
         })
     }
 
-    /// Fits, publishes and sends the result. Continues if the caller disconnects.
-    pub(super) async fn run_refit(self, admitted: Admitted, events: Events) {
-        let result = self.refit(admitted, &events).await;
+    /// Fits, publishes and sends the result. Stops the fit if the caller disconnects before it is
+    /// published.
+    pub(super) async fn run_refit(self, admitted: Admitted, context: CallContext, events: Events) {
+        let result = tokio::select! {
+            result = self.refit(admitted, context, &events) => result,
+            () = events.closed() => {
+                tracing::info!("the fit was cancelled");
+                return;
+            }
+        };
         if let Err(error) = &result {
             tracing::warn!(%error, "the fit failed");
         }
@@ -111,7 +129,12 @@ impl Handlers {
         let _ = events.send(last).await;
     }
 
-    async fn refit(&self, admitted: Admitted, events: &Events) -> Result<pb::RefitResult, Error> {
+    async fn refit(
+        &self,
+        admitted: Admitted,
+        context: CallContext,
+        events: &Events,
+    ) -> Result<pb::RefitResult, Error> {
         let Admitted {
             request,
             identity,
@@ -124,30 +147,35 @@ impl Handlers {
 
         // Held until the adapter is published: a retry meanwhile is rejected instead of starting a
         // second fit.
-        let place = changes.fit_place();
-        let place = place.ok_or_else(|| self.workers.full(Full::Fits))?;
+        let place = changes.fit_place(&context.caller)?;
 
-        let room = request.room.clone();
-        let refit = Refit::prepare(&changes.store, request).await?;
-        if validate_only {
-            return Ok(pb::RefitResult::default());
-        }
-
-        let heard = events.clone();
-        let done = AtomicU32::new(0);
-        let fit = move || {
-            let fitted = refit.fit(&|_| {
-                let progress = pb::RefitProgress {
-                    done: done.fetch_add(1, Ordering::Relaxed) + 1,
-                    total: FITTING_EPOCHS as u32,
-                };
-                let event = Some(pb::refit_room_response::Event::Progress(progress));
-                // A slow caller misses progress events; waiting for it would block the fit.
-                let _ = heard.try_send(Ok(pb::RefitRoomResponse { event }));
-            });
-            fitted.map(|fitted| (refit, fitted))
+        // A fit is bounded by its epochs and cancelled when the caller disconnects, not by the time
+        // limit of requests.
+        let context = CallContext {
+            budget: Duration::MAX,
+            ..context
         };
-        let (refit, fitted) = self.workers.run_unbounded(Lane::Long, fit).await??;
+        let room = request.room.clone();
+        let heard = events.clone();
+        let store = changes.store.clone();
+        let runtime = tokio::runtime::Handle::current();
+        let fit = move |cancel: &Cancellation| {
+            // The room is read when the fit's turn has come, so that queued fits hold no memory.
+            let refit = runtime.block_on(Refit::prepare(&store, request))?;
+            if validate_only {
+                return Ok((refit, None));
+            }
+            let fitted = refit.fit(FitRun {
+                progress: &sends_progress(heard),
+                cancel,
+            })?;
+            Ok((refit, Some(fitted)))
+        };
+        let (refit, fitted) = self.workers.run(Lane::Fit, context, fit).await?;
+        let Some(fitted) = fitted else {
+            return Ok(pb::RefitResult::default());
+        };
+
         let store = changes.store.clone();
         let name = refit.name().to_owned();
         let change = async move {
@@ -164,5 +192,26 @@ impl Handlers {
             }
         };
         changes.once(identity, change, answer).await
+    }
+}
+
+/// Whether an adapter's name belongs to a room: the room's name and one or two parts. The name that
+/// a fit chooses itself has two. With more, a room `lab` could take a name of the room `lab.b`.
+fn is_in_namespace(adapter: &str, room: &str) -> bool {
+    let rest = adapter.strip_prefix(room);
+    let rest = rest.and_then(|rest| rest.strip_prefix('.'));
+    rest.is_some_and(|rest| rest.split('.').count() <= 2)
+}
+
+/// Sends each epoch's progress. A slow caller misses events; waiting for it would block the fit.
+fn sends_progress(events: Events) -> impl Fn(EpochProgress) + Sync {
+    let done = AtomicU32::new(0);
+    move |_| {
+        let progress = pb::RefitProgress {
+            done: done.fetch_add(1, Ordering::Relaxed) + 1,
+            total: FITTING_EPOCHS as u32,
+        };
+        let event = Some(pb::refit_room_response::Event::Progress(progress));
+        let _ = events.try_send(Ok(pb::RefitRoomResponse { event }));
     }
 }

@@ -7,10 +7,10 @@ use nalgebra::Matrix4;
 use ndarray::Array2;
 use prost::Message;
 use sha2::{Digest, Sha256};
-use tokio::sync::OwnedSemaphorePermit;
 use tonic::Streaming;
 
-use super::super::auth::Principal;
+use super::super::caller::{CallerId, Requester};
+use super::super::shares::Share;
 use super::super::snapshot::Snapshot;
 use super::super::workers::Lane;
 use super::super::{Error, Handlers, convert};
@@ -21,7 +21,7 @@ use super::keypoints_upload::ReceivedKeypoints;
 use seese3_client::proto::v1 as pb;
 use seese3_core::features::{FeatureSource, Features, MAX_COLUMNS, UNSPECIFIED};
 use seese3_core::geometry;
-use seese3_core::room::{Frames, Provenance, Room, RoomId, is_plain_name};
+use seese3_core::room::{Frames, MAX_FRAME_NAME, Provenance, Room, RoomId, is_plain_name};
 use seese3_data::pose_check::check_room;
 use seese3_store::{Kind, OtherFeatures, Published, ResourceName, RoomContents, RoomKeypoints};
 
@@ -81,7 +81,9 @@ struct Received {
     digest: Sha256,
     /// Hash of the columns that the caller's checksum does not cover.
     other_columns: Sha256,
-    memory: Vec<OwnedSemaphorePermit>,
+    memory: Vec<Share>,
+    /// The caller that is charged for memory and worker time.
+    caller: CallerId,
 }
 
 impl Handlers {
@@ -89,7 +91,7 @@ impl Handlers {
     /// room.
     pub(super) async fn receive_room(
         &self,
-        caller: Option<Arc<Principal>>,
+        caller: Requester,
         snapshot: Arc<Snapshot>,
         mut messages: Streaming<pb::CreateRoomRequest>,
     ) -> Result<pb::CreateRoomResponse, Error> {
@@ -100,7 +102,7 @@ impl Handlers {
         let Some(Wire::Room(upload)) = first else {
             return Err(Error::invalid("room", "is required in the first message"));
         };
-        let mut received = begun(&upload, caller.as_ref(), &snapshot)?;
+        let mut received = begun(&upload, &caller, &snapshot)?;
         if upload.extend {
             // The existing room and the added frames are joined in memory.
             let known = changes
@@ -110,7 +112,9 @@ impl Handlers {
             let columns: usize = known.features.iter().map(|source| source.dim).sum();
             let keypoints = known.keypoints.map_or(0, |_| KEYPOINT_BYTES);
             let bytes = known.frame_count * (POSE_BYTES + 4 * columns + keypoints);
-            received.memory.push(changes.upload_memory(2 * bytes)?);
+            received
+                .memory
+                .push(changes.upload_memory(&caller.id, 2 * bytes)?);
         }
 
         let end = self
@@ -121,7 +125,7 @@ impl Handlers {
         let mut content = upload.encode_to_vec();
         content.extend(received.other_columns.clone().finalize());
         content.extend(&end.sha256);
-        let identity = identity(caller.as_ref(), &upload.request_id, "CreateRoom", &content);
+        let identity = identity(&caller, &upload.request_id, "CreateRoom", &content);
 
         let name = received.name.name.clone();
         let memory = std::mem::take(&mut received.memory);
@@ -180,8 +184,9 @@ impl Handlers {
         loop {
             match next(messages, "end").await?.message {
                 Some(Wire::Frames(batch)) => {
-                    let arrived = changes.upload_memory(batch.encoded_len())?;
-                    let kept = changes.upload_memory(received.kept_bytes(&batch))?;
+                    let arrived = changes.upload_memory(&received.caller, batch.encoded_len())?;
+                    let kept =
+                        changes.upload_memory(&received.caller, received.kept_bytes(&batch))?;
                     received.memory.push(kept);
                     self.take_batch(received, snapshot, batch)
                         .await
@@ -195,7 +200,8 @@ impl Handlers {
                     };
 
                     let bytes = ReceivedKeypoints::bytes_to_reserve(&part);
-                    received.memory.push(changes.upload_memory(bytes)?);
+                    let memory = changes.upload_memory(&received.caller, bytes)?;
+                    received.memory.push(memory);
                     received.digest.update(&part);
                     keypoints.take(&part);
                 }
@@ -263,7 +269,9 @@ impl Handlers {
         match &received.encode_for {
             Some(adapter) => {
                 check_count("images", images.len(), n)?;
-                let rows = self.encoded(snapshot, adapter.clone(), images).await?;
+                let rows = self
+                    .encoded(&received.caller, snapshot, adapter.clone(), images)
+                    .await?;
                 received.rows[0].extend(rows);
             }
             None if images.is_empty() => {}
@@ -276,9 +284,10 @@ impl Handlers {
         received.take_columns(before, n, timestamps_ns, frame_names, sequences)
     }
 
-    /// Computes the features of images, one after another, on the image worker lane.
+    /// Computes the features of images, one after another, as long work.
     async fn encoded(
         &self,
+        caller: &CallerId,
         snapshot: &Arc<Snapshot>,
         adapter: String,
         images: Vec<Vec<u8>>,
@@ -291,7 +300,8 @@ impl Handlers {
                 let adapter = snapshot.adapter(&adapter)?;
                 snapshot.image_encoder(adapter)?.feature("images", &image)
             };
-            rows.extend(self.workers.run_unbounded(Lane::Images, encode).await??);
+            let encoded = self.workers.run_frame(Lane::Long, caller.clone(), encode);
+            rows.extend(encoded.await??);
         }
 
         Ok(rows)
@@ -301,7 +311,7 @@ impl Handlers {
 /// Checks the first message of an upload.
 fn begun(
     upload: &pb::RoomUpload,
-    caller: Option<&Arc<Principal>>,
+    caller: &Requester,
     snapshot: &Snapshot,
 ) -> Result<Received, Error> {
     let within = |error: Error| error.within("room");
@@ -346,6 +356,7 @@ fn begun(
         digest: Sha256::new(),
         other_columns: Sha256::new(),
         memory: Vec::new(),
+        caller: caller.id.clone(),
     })
 }
 
@@ -484,6 +495,13 @@ impl Received {
 
         for timestamp in &timestamps_ns {
             self.other_columns.update(timestamp.to_le_bytes());
+        }
+        if let Some(name) = frame_names.iter().find(|name| name.len() > MAX_FRAME_NAME) {
+            let problem = format!(
+                "has a name of {} bytes; the limit is {MAX_FRAME_NAME}",
+                name.len()
+            );
+            return Err(Error::invalid("frame_names", problem));
         }
         for name in &frame_names {
             self.other_columns.update((name.len() as u64).to_le_bytes());

@@ -6,6 +6,7 @@
 
 use std::pin::Pin;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
@@ -21,31 +22,48 @@ use super::super::connections::Peer;
 /// Maximum data frame size, bytes; HTTP/2's default.
 const PIECE: usize = 16 << 10;
 
-/// Progress timeout of a response. A caller that receives nothing for that time loses its
-/// connection, because data in flight cannot be withdrawn otherwise.
+/// Progress timeout of a response. A caller that receives nothing for that time, while there is
+/// something to receive, loses its connection: data in flight cannot be withdrawn otherwise.
 pub struct ResponseTimeout {
-    /// Notified whenever the transport polls for a piece.
-    taken: Arc<Notify>,
+    progress: Arc<Progress>,
     waiting: JoinHandle<()>,
+}
+
+#[derive(Default)]
+struct Progress {
+    /// Notified whenever the transport polls for a piece.
+    polled: Notify,
+    /// Whether the handler has nothing to send: the caller need not receive anything.
+    is_waiting: AtomicBool,
 }
 
 impl ResponseTimeout {
     /// Starts the timeout.
     pub fn new(peer: Peer, limit: Duration) -> Self {
-        let taken = Arc::new(Notify::new());
-        let progress = taken.clone();
+        let progress = Arc::new(Progress::default());
+        let watched = progress.clone();
         let waiting = tokio::spawn(async move {
-            while tokio::time::timeout(limit, progress.notified())
-                .await
-                .is_ok()
-            {}
+            loop {
+                let polled = tokio::time::timeout(limit, watched.polled.notified()).await;
+                if polled.is_err() && !watched.is_waiting.load(Ordering::Relaxed) {
+                    break;
+                }
+            }
             if peer.close() {
                 let address = peer.address;
                 tracing::warn!(%address, "response timeout: connection closed");
             }
         });
 
-        Self { taken, waiting }
+        Self { progress, waiting }
+    }
+
+    /// Records that the transport polled; `is_waiting` if there was nothing to send.
+    fn polled(&self, is_waiting: bool) {
+        self.progress
+            .is_waiting
+            .store(is_waiting, Ordering::Relaxed);
+        self.progress.polled.notify_one();
     }
 }
 
@@ -79,12 +97,12 @@ impl http_body::Body for Pieces {
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
-        if let Some(timeout) = &self.timeout {
-            timeout.taken.notify_one();
-        }
-
         if self.rest.is_empty() {
             let polled = Pin::new(&mut self.body).poll_frame(context);
+            if let Some(timeout) = &self.timeout {
+                timeout.polled(polled.is_pending());
+            }
+
             let Poll::Ready(Some(Ok(frame))) = polled else {
                 return polled;
             };
@@ -94,6 +112,9 @@ impl http_body::Body for Pieces {
             }
         }
 
+        if let Some(timeout) = &self.timeout {
+            timeout.polled(false);
+        }
         let length = self.rest.len().min(PIECE);
         let piece = self.rest.split_to(length);
         Poll::Ready(Some(Ok(Frame::data(piece))))

@@ -15,6 +15,8 @@ use std::sync::Arc;
 use futures_util::StreamExt;
 use tokio::runtime::Handle;
 
+use super::super::DECODING;
+use super::super::decoding::DecodingMemory;
 use super::super::image_encoder::{self, ImageEncoder, ImageEncoders};
 use super::super::metrics::Metrics;
 use super::super::{Config, RunError};
@@ -69,6 +71,7 @@ pub struct Loader {
     rooms: Arc<RoomCache>,
     memory: RoomMemory,
     encoders: Option<ImageEncoders>,
+    decoding: Arc<DecodingMemory>,
     metrics: Metrics,
 }
 
@@ -83,8 +86,10 @@ impl Loader {
             rooms: memory,
             encoders,
             metrics,
+            memory_bytes,
             ..
         } = config.clone();
+        let decoding = Arc::new(DecodingMemory::new((memory_bytes / DECODING) as u64));
 
         blocking(move || {
             if let Some(encoders) = &encoders {
@@ -103,6 +108,7 @@ impl Loader {
                 rooms,
                 memory,
                 encoders,
+                decoding,
                 metrics,
             })
         })
@@ -317,7 +323,7 @@ impl Loader {
             let encoder = match opened.iter().find(|(other, _)| other.is_like(source)) {
                 Some((_, encoder)) => encoder.clone(),
                 None => {
-                    let encoder = opened_for(name, source, encoders)
+                    let encoder = opened_for(name, source, encoders, self.decoding.clone())
                         .map(|encoder| Arc::new(encoder.counted_in(self.metrics.clone())));
                     opened.push((source.clone(), encoder.clone()));
                     encoder
@@ -354,7 +360,7 @@ impl Loader {
 
             match Encoder::of_keypoints(source, &encoders.models, &encoders.runtime) {
                 Ok(Some(encoder)) => {
-                    let encoder = ImageEncoder::new(encoder, encoders.bounds);
+                    let encoder = ImageEncoder::new(encoder, encoders, self.decoding.clone());
                     let encoder = Arc::new(encoder.counted_in(self.metrics.clone()));
                     loaded.keypoint_encoders.push((source.clone(), encoder));
                 }
@@ -532,9 +538,10 @@ fn opened_for(
     adapter: &str,
     source: &FeatureSource,
     encoders: &ImageEncoders,
+    decoding: Arc<DecodingMemory>,
 ) -> Option<ImageEncoder> {
     let opened: Result<_, seese3_encoder::Error> =
-        image_encoder::open_for(adapter, source, encoders);
+        image_encoder::open_for(adapter, source, encoders, decoding);
     opened.unwrap_or_else(|problem| {
         tracing::error!(adapter, %problem, "no image encoder; the adapter takes only features");
         None

@@ -187,6 +187,11 @@ impl Snapshot {
         })
     }
 
+    /// Any encoder of images, for the limits that all share; `None` if this server has none.
+    pub fn any_image_encoder(&self) -> Option<&ImageEncoder> {
+        self.image_encoders.values().next().map(AsRef::as_ref)
+    }
+
     /// The encoder of keypoints; `None` if this server has no such encoder.
     pub fn keypoint_encoder(&self, source: &KeypointSource) -> Option<&ImageEncoder> {
         let mut encoders = self.keypoint_encoders.iter();

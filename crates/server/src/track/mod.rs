@@ -29,8 +29,11 @@ use tonic::{Request, Status, Streaming};
 use tracing::Instrument;
 
 use super::auth::{Keyring, Principal};
+use super::caller::CallerId;
+use super::memory::StreamMemory;
+use super::shares::Share;
 use super::status::Full;
-use super::workers::Lane;
+use super::workers::{CallContext, Lane};
 use super::{Error, Handlers, Phase, principal};
 use inertial::MOST_SAMPLES;
 use seese3_client::proto::v1 as pb;
@@ -48,6 +51,8 @@ const UNREAD: usize = 32;
 struct Incoming {
     since: Instant,
     message: Result<Message, Status>,
+    /// Memory of the message, held until it is answered.
+    memory: Option<Share>,
     overtaken: Option<Overtaken>,
 }
 
@@ -74,6 +79,11 @@ impl Handlers {
     ) -> Result<Answers, Status> {
         let snapshot = self.snapshot(&request)?;
         let caller = principal(&request).cloned();
+        let context = CallContext {
+            budget: self.config.longest,
+            ..self.workers.context(&request)
+        };
+        let memory = request.extensions().get().cloned().unwrap_or_default();
         let mut requests = request.into_inner();
 
         // A stream has no deadline, but its configuration must arrive in time: streams without one
@@ -115,7 +125,7 @@ impl Handlers {
         let key = self.config.token_key.clone();
         let session = self
             .workers
-            .run(Lane::Short, self.config.longest, move |_| {
+            .run(Lane::Short, context.clone(), move |_| {
                 Session::open(&snapshot, config, &key)
             })
             .await?;
@@ -124,13 +134,14 @@ impl Handlers {
         // unread, so that flow control makes the sender wait.
         let (sender, frames) = mpsc::channel(1);
         let (answers, stream) = mpsc::channel(UNREAD);
-        tokio::spawn(read(requests, sender, session.newest_wins()));
+        let newest_wins = session.newest_wins();
+        tokio::spawn(read(Messages { requests, memory }, sender, newest_wins));
         let handlers = self.clone();
 
         let run = async move {
             let mut phase = handlers.phase.clone();
             tokio::select! {
-                () = handlers.answer_all(session, frames, &answers) => {}
+                () = handlers.answer_all(context.caller, session, frames, &answers) => {}
                 () = revoked(handlers.config.keyring.as_ref(), caller.as_ref()) => {
                     let revoked = Error::Unauthenticated {
                         problem: "the caller's rights have changed, or its token has expired; open \
@@ -154,6 +165,7 @@ impl Handlers {
 
     async fn answer_all(
         &self,
+        caller: CallerId,
         mut session: Session,
         mut frames: mpsc::Receiver<Incoming>,
         answers: &mpsc::Sender<Result<pb::TrackResponse, Status>>,
@@ -166,6 +178,7 @@ impl Handlers {
         while let Some(Incoming {
             since,
             message,
+            memory,
             overtaken,
         }) = frames.recv().await
         {
@@ -178,7 +191,7 @@ impl Handlers {
 
             // A refused frame is a normal answer. An error ends the stream and is its last item.
             let answer = match message {
-                Ok(message) => match self.handled(session, message, since).await {
+                Ok(message) => match self.handled(&caller, session, message, since).await {
                     Ok((back, answer)) => {
                         session = back;
                         if let Some(outcome) = answer.as_ref().ok().and_then(outcome) {
@@ -194,6 +207,7 @@ impl Handlers {
                 Err(status) => Err(status),
             };
 
+            drop(memory);
             let ends = answer.is_err();
             if answers.send(answer).await.is_err() || ends {
                 return;
@@ -209,6 +223,7 @@ impl Handlers {
     /// stopping. The inner error is the answer to the message.
     async fn handled(
         &self,
+        caller: &CallerId,
         mut session: Session,
         message: Message,
         since: Instant,
@@ -224,7 +239,7 @@ impl Handlers {
             _ => Lane::Short,
         };
         self.workers
-            .run_unbounded(lane, move || {
+            .run_frame(lane, caller.clone(), move || {
                 let answer = match message {
                     Message::Frame(frame) => session.take(frame, since.elapsed()),
                     Message::SetInitialPose(given) => Ok(session.put(given)),
@@ -272,11 +287,7 @@ async fn shutdown_requested(phase: &mut watch::Receiver<Phase>) {
 /// Reads messages as they arrive and passes them to `sender`, holding at most one. With
 /// `newest_wins` it continues to read while a message waits, and a newer frame replaces a waiting
 /// frame. Ends at the end of the stream, at its first error, or when the receiver is closed.
-async fn read(
-    mut requests: Streaming<pb::TrackRequest>,
-    sender: mpsc::Sender<Incoming>,
-    newest_wins: bool,
-) {
+async fn read(mut messages: Messages, sender: mpsc::Sender<Incoming>, newest_wins: bool) {
     let mut waiting: Option<Incoming> = None;
     loop {
         let may_read = waiting.is_none() || newest_wins;
@@ -295,15 +306,20 @@ async fn read(
                     return;
                 }
             }
-            next = requests.next(), if may_read => {
-                let Some(next) = next else {
+            next = messages.next(), if may_read => {
+                let Some((next, memory)) = next else {
                     if let Some(came) = waiting.take() {
                         // `send` fails if the receiver is closed.
                         let _ = sender.send(came).await;
                     }
                     return;
                 };
-                let mut came = Incoming { since: Instant::now(), message: message_of(next), overtaken: None };
+                let mut came = Incoming {
+                    since: Instant::now(),
+                    message: message_of(next),
+                    memory,
+                    overtaken: None,
+                };
                 if let Some(before) = waiting.take()
                     && let Some(before) = overtake(before, &mut came)
                     && sender.send(before).await.is_err()
@@ -313,6 +329,20 @@ async fn read(
                 waiting = Some(came);
             }
         }
+    }
+}
+
+/// The messages of a stream with their memory.
+struct Messages {
+    requests: Streaming<pb::TrackRequest>,
+    memory: StreamMemory,
+}
+
+impl Messages {
+    /// The next message, and the memory to hold as long as it.
+    async fn next(&mut self) -> Option<(Result<pb::TrackRequest, Status>, Option<Share>)> {
+        let next = self.requests.next().await?;
+        Some((next, self.memory.take()))
     }
 }
 

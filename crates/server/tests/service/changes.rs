@@ -580,8 +580,8 @@ async fn only_those_who_may_change_what_they_may() {
     }
 }
 
-/// Oracle: the bound on waiting changes: each is made or refused as one too many, and the server
-/// goes on. More than one blocking thread each would be more than there are.
+/// Oracle: the bound on waiting changes of one caller, half of 64: each is made or refused as one
+/// too many, and the server goes on. More than one blocking thread each would be more than there are.
 #[tokio::test]
 async fn many_changes_at_once_are_made_or_refused() {
     let (server, store) = start_writable().await;
@@ -606,7 +606,7 @@ async fn many_changes_at_once_are_made_or_refused() {
     let codes = changes.join_all().await;
     let count = |code: Code| codes.iter().filter(|found| **found == code).count();
     assert_eq!(count(Code::Ok) + count(Code::ResourceExhausted), 600);
-    assert!(count(Code::Ok) >= 64, "{} were made", count(Code::Ok));
+    assert!(count(Code::Ok) >= 32, "{} were made", count(Code::Ok));
 
     assert!(server.client.navigate(question()).await.is_ok());
     assert!(store.verify(&|_| ()).await.unwrap().is_empty());

@@ -8,7 +8,7 @@ use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::PoseError;
 use seese3_core::room::FrameId;
 use seese3_core::training::RoomData;
-use seese3_robot::fitting::fit;
+use seese3_robot::fitting::{FitRun, fit};
 use seese3_server::Config;
 use seese3_store::{BaseAdapter, RoomFit, Store};
 use tonic::Code;
@@ -38,7 +38,14 @@ async fn server() -> TestServer {
         features: &features,
     };
     let mapped: Vec<FrameId> = (0..room.frame_count() as u32).map(FrameId).collect();
-    let fitted = fit(&data, &mapped, Some(&Arc::new(adapter)), 0, &|_| ()).unwrap();
+    let fitted = fit(
+        &data,
+        &mapped,
+        Some(&Arc::new(adapter)),
+        0,
+        FitRun::UNWATCHED,
+    )
+    .unwrap();
     let room_fit = RoomFit {
         room: room.id().clone(),
         room_revision: 1,

@@ -87,6 +87,7 @@ fn with_encoders(models: &[&str]) -> Config {
             bytes: 1 << 20,
             pixels: 10_000,
         },
+        request_pixels: ImageEncoders::REQUEST_PIXELS,
     };
 
     Config {

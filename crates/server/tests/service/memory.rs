@@ -37,11 +37,11 @@ async fn bodies_that_never_arrive_hold_little_and_not_for_long() {
     let expected = 10 * ((16 << 10) + 1_000);
     until_held(&metrics, |held| held == expected).await;
 
-    // As many as fit: a further call is refused, and is answered when they have been given up.
+    // As many as the share of a connection: others are answered.
     let many = silent_calls(&server.address, 200, &[]).await;
-    until_held(&metrics, |held| held > (2 << 20) - (17 << 10)).await;
-    let refused = server.client.navigate(question()).await.unwrap_err();
-    assert_eq!(refused.code(), Some(Code::ResourceExhausted));
+    let share = ((2 << 20) - expected) / 2;
+    until_held(&metrics, |held| held > expected + share - (17 << 10)).await;
+    assert!(server.client.navigate(question()).await.is_ok());
 
     clock.advance(Duration::from_secs(2)).await;
     until_held(&metrics, |held| held == 0).await;
@@ -121,9 +121,13 @@ async fn a_response_that_is_not_received_is_not_kept() {
         stream.write_all(&call.concat()).await.unwrap();
 
         // The response has far more than one piece; what was taken over goes with the connection.
+        // Its memory is held from before it is computed, its time limit begins after that.
         until_held(&metrics, |held| held > 200_000).await;
-        clock.advance(Duration::from_secs(2)).await;
-        until_held(&metrics, |held| held == 0).await;
+        let held = async || {
+            clock.advance(Duration::from_secs(2)).await;
+            metric(&metrics, "seese3_memory_held_bytes").unwrap()
+        };
+        until("the response is given up", held, |held| *held == 0.0).await;
         let mut rest = Vec::new();
         let _ = soon("the connection is closed", stream.read_to_end(&mut rest)).await;
     }

@@ -9,7 +9,9 @@
 
 mod dying;
 mod extension;
+mod faults;
 mod room_keypoints;
+mod simulation;
 mod store;
 mod store_care;
 

@@ -5,7 +5,6 @@
 //! a file's first bytes, not from its name.
 
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -98,7 +97,7 @@ fn form_of(file: &Path) -> Result<Form, Error> {
         });
     }
     let mut first = Vec::new();
-    let opened = File::open(file).map_err(io)?;
+    let opened = seese3_files::open(file).map_err(io)?;
     opened.take(16).read_to_end(&mut first).map_err(io)?;
 
     let problem = match first.as_slice() {

@@ -2,7 +2,6 @@
 
 use seese3_core::Cause;
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
@@ -33,7 +32,7 @@ pub fn each_message(
         malformed(format!("is a truncated or damaged MCAP file: {error}").into())
     };
 
-    let mut source = File::open(file).map_err(io)?;
+    let mut source = seese3_files::open(file).map_err(io)?;
     let length = source.metadata().map_err(io)?.len();
     let length = usize::try_from(length).unwrap_or(usize::MAX);
     // CRCs are checked before messages are used: flipped bits would decode as wrong poses.

@@ -1,18 +1,32 @@
 //! Computes answers on a bounded number of blocking threads, within the caller's deadline.
 //!
-//! Short requests, images and long work have separate lanes, each with its own threads and queue. A
-//! long evaluation or a slow encoder therefore does not delay short requests. The operating system
-//! schedules the threads of all lanes.
+//! - Each [`Lane`] has its own threads and queue: short requests, images, long requests,
+//!   evaluations and fits. Within a lane, callers share the time of the threads.
+//! - A job that runs longer than a time slice is paused where it checks for cancellation, while
+//!   other jobs of its lane wait.
+//!
+//! | file | what |
+//! | --- | --- |
+//! | `fair_queue` | chooses the next job |
+//! | `pool` | the threads of a lane |
+
+mod fair_queue;
+mod pool;
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
+use tonic::Request;
 use tonic::metadata::MetadataMap;
 
+use super::caller::CallerId;
 use super::metrics::Metrics;
+use super::shares::Exhausted;
 use super::status::Full;
 use super::{Config, Error};
+use fair_queue::Urgency;
+use pool::{Pool, pause_if_others_wait};
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
 
@@ -21,21 +35,22 @@ use seese3_core::cancel::Cancellation;
 pub enum Lane {
     /// Work of at most milliseconds, for instance in a robot's control loop.
     Short,
-    /// Requests with images to decode and encode.
+    /// Requests with one image or two, and frames of streams with images.
     Images,
-    /// Batches, evaluations and fits.
+    /// Batches, lists of images, and other requests with a large estimated cost.
     Long,
+    /// Evaluations: minutes of work.
+    Evaluation,
+    /// Fits, one at a time: a fit uses all processors.
+    Fit,
 }
 
 impl Lane {
     /// [`Lane::Images`] if any of these views is an image, else [`Lane::Short`].
     pub fn of<'a>(views: impl IntoIterator<Item = &'a pb::View>) -> Self {
-        let is_image = |view: &pb::View| matches!(view.view, Some(pb::view::View::Image(_)));
-
-        if views.into_iter().any(is_image) {
-            Self::Images
-        } else {
-            Self::Short
+        match image_count(views) {
+            0 => Self::Short,
+            _ => Self::Images,
         }
     }
 
@@ -45,24 +60,42 @@ impl Lane {
             Self::Short => Full::ShortRequests,
             Self::Images => Full::Images,
             Self::Long => Full::LongRequests,
+            Self::Evaluation => Full::Evaluations,
+            Self::Fit => Full::Fits,
         }
     }
 }
 
-/// The threads and the queue of a lane.
-#[derive(Clone)]
-struct Pool {
-    threads: Arc<Semaphore>,
-    admitted: Arc<Semaphore>,
+/// The number of images among views.
+pub fn image_count<'a>(views: impl IntoIterator<Item = &'a pb::View>) -> usize {
+    images_of(views).count()
 }
 
-impl Pool {
-    fn new(threads: usize, queue: usize) -> Self {
+/// The images among views.
+pub fn images_of<'a>(
+    views: impl IntoIterator<Item = &'a pb::View>,
+) -> impl Iterator<Item = &'a [u8]> {
+    views.into_iter().filter_map(|view| match &view.view {
+        Some(pb::view::View::Image(image)) => Some(image.as_slice()),
+        _ => None,
+    })
+}
+
+/// The caller of a computation and its time budget.
+#[derive(Debug, Clone)]
+pub struct CallContext {
+    /// The caller that is charged for the worker time.
+    pub caller: CallerId,
+    /// The time budget of the call, including time in the queue.
+    pub budget: Duration,
+}
+
+impl CallContext {
+    /// The same caller with the time that is left after `elapsed`.
+    pub fn after(self, elapsed: Duration) -> Self {
         Self {
-            threads: Arc::new(Semaphore::new(threads)),
-            // A request holds this permit while it waits and runs. `try_acquire` fails once threads
-            // and queue are full.
-            admitted: Arc::new(Semaphore::new(threads + queue)),
+            budget: self.budget.saturating_sub(elapsed),
+            ..self
         }
     }
 }
@@ -73,6 +106,8 @@ pub struct Workers {
     short: Pool,
     images: Pool,
     long: Pool,
+    evaluation: Pool,
+    fit: Pool,
     longest: Duration,
     halted: watch::Sender<bool>,
     metrics: Metrics,
@@ -91,11 +126,14 @@ impl Workers {
     pub fn new(config: &Config) -> Self {
         let threads = config.threads.max(1);
         let pool = |threads| Pool::new(threads, config.queue);
+        // Long work gets half as many threads.
+        let half = threads.div_ceil(2);
         Self {
             short: pool(threads),
             images: pool(threads),
-            // Long work gets half as many threads.
-            long: pool(threads.div_ceil(2)),
+            long: pool(half),
+            evaluation: pool(half),
+            fit: pool(1),
             longest: config.longest,
             halted: watch::Sender::new(false),
             metrics: config.metrics.clone(),
@@ -107,6 +145,8 @@ impl Workers {
             Lane::Short => &self.short,
             Lane::Images => &self.images,
             Lane::Long => &self.long,
+            Lane::Evaluation => &self.evaluation,
+            Lane::Fit => &self.fit,
         }
     }
 
@@ -126,73 +166,77 @@ impl Workers {
         caller_deadline(metadata).map_or(self.longest, |deadline| deadline.min(self.longest))
     }
 
+    /// The context of a request's computation.
+    pub fn context<T>(&self, request: &Request<T>) -> CallContext {
+        CallContext {
+            caller: CallerId::of(request.extensions()),
+            budget: self.budget(request.metadata()),
+        }
+    }
+
     /// Runs `work` on a blocking thread. If the budget is spent or the caller goes away, `work` is
     /// cancelled through its [`Cancellation`]. Its thread becomes free when `work` returns.
     ///
     /// # Errors
-    /// [`Error::Full`] if the lane's queue is full, [`Error::Deadline`] if the budget is spent,
-    /// [`Error::Loading`] if the stopping server abandoned the work, [`Error::Internal`] if it
-    /// panicked, or the error of `work`.
+    /// [`Error::Full`] if the lane's queue or the caller's share of it is full,
+    /// [`Error::Deadline`] if the budget is spent, [`Error::Loading`] if the stopping server
+    /// abandoned the work, [`Error::Internal`] if it panicked, or the error of `work`.
     pub async fn run<T: Send + 'static>(
         &self,
         lane: Lane,
-        budget: Duration,
+        context: CallContext,
         work: impl FnOnce(&Cancellation) -> Result<T, Error> + Send + 'static,
     ) -> Result<T, Error> {
-        let admitted = self.pool(lane).admitted.clone().try_acquire_owned();
-        let admitted = admitted.map_err(|_| self.full(lane.full()))?;
-
         // If the caller goes away, this future is dropped and the guard cancels the running work.
-        let cancel = Arc::new(Cancellation::default());
+        let cancel = Arc::new(Cancellation::with_checkpoint(pause_if_others_wait));
         let guard = CancelOnDrop(cancel.clone());
-
-        // The permit moves into the blocking task: it outlives this future if that is dropped.
-        let computed = self.on_thread(lane, move || {
-            let _admitted = admitted;
+        let computed = self.on_thread(lane, context.caller, Urgency::Request, move || {
             work(&cancel)
         });
 
         // The budget includes the time in the queue.
-        let result = tokio::time::timeout(budget, computed).await;
+        let result = tokio::time::timeout(context.budget, computed).await;
         drop(guard);
         result.unwrap_or(Err(Error::Deadline))?
     }
 
-    /// Runs work on a blocking thread that was admitted elsewhere: a frame of a stream, an image of
-    /// an upload, a fit. It waits for a thread without limit, is never refused, and is not
-    /// cancelled.
+    /// Runs the work of a frame of a stream on a blocking thread. It waits for a thread without
+    /// limit, is never refused, and is not cancelled.
     ///
     /// # Errors
     /// [`Error::Loading`] if the stopping server abandoned the work, [`Error::Internal`] if it
     /// panicked.
-    pub async fn run_unbounded<T: Send + 'static>(
+    pub async fn run_frame<T: Send + 'static>(
         &self,
         lane: Lane,
+        caller: CallerId,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<T, Error> {
         // Dropping the future only discards the result.
-        self.on_thread(lane, work).await
+        self.on_thread(lane, caller, Urgency::Frame, work).await
     }
 
-    /// Runs `work` on a blocking thread of the lane as soon as one is free.
+    /// Runs `work` on a blocking thread of the lane as soon as it is the caller's turn.
     async fn on_thread<T: Send + 'static>(
         &self,
         lane: Lane,
+        caller: CallerId,
+        urgency: Urgency,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<T, Error> {
         let mut halted = self.halted.subscribe();
-        let threads = self.pool(lane).threads.clone();
-
         let computed = async {
-            let thread = threads.acquire_owned().await;
-            let thread = thread.map_err(|_| Error::Internal)?;
+            let turn = self.pool(lane).turn(&caller, urgency).await;
+            let turn = turn.map_err(|limit| {
+                self.full(match limit {
+                    Exhausted::Budget => lane.full(),
+                    Exhausted::Share => Full::CallersQueue,
+                })
+            })?;
 
-            // The permit is held until the computation ends, even if this future is dropped.
+            // The turn lasts until the computation ends, even if this future is dropped.
             let span = tracing::Span::current();
-            let task = tokio::task::spawn_blocking(move || {
-                let _thread = thread;
-                span.in_scope(work)
-            });
+            let task = tokio::task::spawn_blocking(move || turn.run(|| span.in_scope(work)));
 
             task.await.map_err(|error| {
                 tracing::error!(%error, "a request panicked");
@@ -241,7 +285,16 @@ mod tests {
         })
     }
 
-    const LONG: Duration = Duration::from_secs(30);
+    fn context(caller: u64, budget: Duration) -> CallContext {
+        CallContext {
+            caller: CallerId::Connection(caller),
+            budget,
+        }
+    }
+
+    fn long() -> CallContext {
+        context(1, Duration::from_secs(30))
+    }
 
     /// Oracle: the contract: a panic fails one request, and the next one succeeds.
     #[tokio::test]
@@ -249,12 +302,12 @@ mod tests {
         let workers = workers(1, 0);
         assert_eq!(
             workers
-                .run::<()>(Lane::Short, LONG, |_| panic!("on purpose"))
+                .run::<()>(Lane::Short, long(), |_| panic!("on purpose"))
                 .await,
             Err(Error::Internal)
         );
 
-        assert_eq!(workers.run(Lane::Short, LONG, |_| Ok(7)).await, Ok(7));
+        assert_eq!(workers.run(Lane::Short, long(), |_| Ok(7)).await, Ok(7));
     }
 
     /// Oracle: the contract. The work loops until it is cancelled and then reports that.
@@ -275,7 +328,8 @@ mod tests {
         };
 
         let budget = Duration::from_millis(20);
-        let running = tokio::spawn(async move { workers.run(Lane::Short, budget, work).await });
+        let running =
+            tokio::spawn(async move { workers.run(Lane::Short, context(1, budget), work).await });
         begins.await.unwrap();
 
         // The clock stands still until it is advanced, because the work runs.
@@ -296,7 +350,7 @@ mod tests {
         let (begun, begins) = tokio::sync::oneshot::channel();
 
         let first = tokio::spawn(async move {
-            busy.run(Lane::Short, LONG, move |_| {
+            busy.run(Lane::Short, long(), move |_| {
                 let _ = begun.send(());
                 let _ = wait.recv();
                 Ok(1)
@@ -308,14 +362,86 @@ mod tests {
         let full = Error::Full {
             what: Full::ShortRequests,
         };
-        assert_eq!(workers.run(Lane::Short, LONG, |_| Ok(2)).await, Err(full));
+        assert_eq!(workers.run(Lane::Short, long(), |_| Ok(2)).await, Err(full));
 
         // The other lanes are free.
-        assert_eq!(workers.run(Lane::Long, LONG, |_| Ok(3)).await, Ok(3));
-        assert_eq!(workers.run(Lane::Images, LONG, |_| Ok(4)).await, Ok(4));
+        assert_eq!(workers.run(Lane::Long, long(), |_| Ok(3)).await, Ok(3));
+        assert_eq!(workers.run(Lane::Images, long(), |_| Ok(4)).await, Ok(4));
 
         release.send(()).unwrap();
         assert_eq!(first.await.unwrap(), Ok(1));
+    }
+
+    /// Oracle: the contract: a job that checks for cancellation passes its only thread on to the job
+    /// of another caller, and then goes on.
+    #[tokio::test]
+    async fn a_long_job_is_paused_while_others_wait() {
+        let workers = workers(1, 8);
+        let (begun, begins) = tokio::sync::oneshot::channel();
+        let (release, wait) = std::sync::mpsc::channel::<()>();
+        let busy = workers.clone();
+        let first = tokio::spawn(async move {
+            busy.run(Lane::Long, long(), move |cancel| {
+                let _ = begun.send(());
+                while wait.try_recv().is_err() {
+                    cancel.check()?;
+                }
+                Ok(1)
+            })
+            .await
+        });
+
+        begins.await.unwrap();
+        let other = context(2, Duration::from_secs(30));
+        assert_eq!(workers.run(Lane::Long, other, |_| Ok(2)).await, Ok(2));
+        assert!(!first.is_finished());
+        release.send(()).unwrap();
+        assert_eq!(first.await.unwrap(), Ok(1));
+    }
+
+    /// Oracle: by hand from the rule of the shares: of four places one caller gets two, another
+    /// one. A job that is no longer wanted frees its place.
+    #[tokio::test]
+    async fn callers_share_the_queue() {
+        let workers = workers(1, 4);
+        let (release, wait) = std::sync::mpsc::channel::<()>();
+        let (begun, begins) = tokio::sync::oneshot::channel();
+        let busy = workers.clone();
+        let running = tokio::spawn(async move {
+            busy.run(Lane::Short, long(), move |_| {
+                let _ = begun.send(());
+                let _ = wait.recv();
+                Ok(())
+            })
+            .await
+        });
+        begins.await.unwrap();
+
+        let mut queued: Vec<_> = (0..2)
+            .map(|_| Box::pin(workers.run(Lane::Short, long(), |_| Ok(()))))
+            .collect();
+        for job in &mut queued {
+            assert!(futures_util::poll!(job).is_pending());
+        }
+        let full = Err(Error::Full {
+            what: Full::CallersQueue,
+        });
+        assert_eq!(workers.run(Lane::Short, long(), |_| Ok(())).await, full);
+
+        let other = || context(2, Duration::from_secs(30));
+        let mut others = Box::pin(workers.run(Lane::Short, other(), |_| Ok(())));
+        assert!(futures_util::poll!(&mut others).is_pending());
+        assert_eq!(workers.run(Lane::Short, other(), |_| Ok(())).await, full);
+
+        drop(queued.pop());
+        let mut again = Box::pin(workers.run(Lane::Short, long(), |_| Ok(())));
+        assert!(futures_util::poll!(&mut again).is_pending());
+
+        release.send(()).unwrap();
+        let first = queued.remove(0);
+        let ended = futures_util::future::join3(first, others, again).await;
+        assert_eq!(ended, (Ok(()), Ok(()), Ok(())));
+        assert_eq!(running.await.unwrap(), Ok(()));
     }
 
     /// Oracle: the gRPC specification of `grpc-timeout`: up to eight digits and a unit.

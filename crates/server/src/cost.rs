@@ -1,0 +1,175 @@
+//! Estimated costs of requests: the lane of the work, before it starts, and the size of the answer.
+//!
+//! Time is counted in comparisons: one comparison of a view with one stored frame, about 10 ns.
+
+use super::snapshot::Snapshot;
+use super::workers::{Lane, image_count};
+use seese3_client::proto::v1 as pb;
+use seese3_core::navigation::IndexKind;
+use seese3_core::room::Room;
+
+/// Cost limit of the lane for short requests, comparisons: about 10 ms.
+const SHORT: f64 = 1e6;
+/// Maximum number of images of a request in the lane for images: a stereo pair.
+const IMAGES: usize = 2;
+/// Maximum number of rooms in whose keypoints an image is searched in the lane for images.
+const MATCHED_ROOMS: usize = 8;
+
+/// Estimates the costs of requests to the rooms of a snapshot.
+pub struct Costs<'a> {
+    pub snapshot: &'a Snapshot,
+    pub index: IndexKind,
+}
+
+impl Costs<'_> {
+    /// Lane of a Navigate request.
+    pub fn navigate(&self, request: &pb::NavigateRequest) -> Lane {
+        let images = image_count(&request.source);
+        let steps = step_count(request) as f64;
+        lane(images, steps * self.comparisons(&request.room))
+    }
+
+    /// Lane of a Localize or Relocalize request.
+    pub fn locate(&self, rooms: &[String], views: &[pb::View]) -> Lane {
+        let images = image_count(views);
+        let (room_count, comparisons) = match rooms {
+            [] => {
+                let all = self.snapshot.rooms();
+                let comparisons: f64 = all.keys().map(|room| self.comparisons(room)).sum();
+                (all.len(), comparisons)
+            }
+            named => {
+                // A list with more names than there are rooms is refused later.
+                let most = self.snapshot.rooms().len();
+                let named = named.iter().take(most);
+                (named.len(), named.map(|room| self.comparisons(room)).sum())
+            }
+        };
+
+        match lane(images, views.len() as f64 * comparisons) {
+            Lane::Images if room_count > MATCHED_ROOMS => Lane::Long,
+            lane => lane,
+        }
+    }
+
+    /// Lane of a ListFrames request for `frames` frames. The neighbors of a frame are searched
+    /// among all frames of the room.
+    pub fn list_frames(&self, request: &pb::ListFramesRequest, frames: usize) -> Lane {
+        let thumbnails = match request.thumbnail_width {
+            Some(_) => frames,
+            None => 0,
+        };
+        let neighbors = match request.neighbours_within {
+            Some(_) => frames as f64 * self.frame_count(&request.room) as f64,
+            None => frames as f64,
+        };
+        lane(thumbnails, neighbors)
+    }
+
+    /// Comparisons of one view with a room; 0 for an unknown room.
+    fn comparisons(&self, room: &str) -> f64 {
+        self.index.comparisons(self.frame_count(room)) as f64
+    }
+
+    fn frame_count(&self, room: &str) -> usize {
+        let room = self.snapshot.rooms().get(room);
+        room.map_or(0, |room| room.summary.frame_count)
+    }
+}
+
+/// Lane of a request with images to decode and comparisons.
+pub fn lane(images: usize, comparisons: f64) -> Lane {
+    if images > IMAGES || comparisons > SHORT {
+        Lane::Long
+    } else if images > 0 {
+        Lane::Images
+    } else {
+        Lane::Short
+    }
+}
+
+/// Number of steps that a Navigate request asks for, of all motions.
+pub fn step_count(request: &pb::NavigateRequest) -> u64 {
+    let displacement = request.displacement.as_ref();
+    let motions = match displacement.and_then(|given| given.displacement.as_ref()) {
+        Some(pb::displacement::Displacement::Twists(list)) => list.twists.len() as u64,
+        _ => 1,
+    };
+
+    u64::from(request.steps.unwrap_or(1)).saturating_mul(motions)
+}
+
+/// Upper bound of the encoded size of a retrieved frame with its pose and name, bytes.
+pub fn frame_bytes(room: &Room) -> usize {
+    /// Numbers of the frame and its pose, with their tags.
+    const NUMBERS: usize = 140;
+    NUMBERS + room.id().as_str().len() + room.longest_frame_name()
+}
+
+/// Upper bound of the encoded size of a step without its frames, bytes.
+pub fn step_bytes(latent_dim: usize, thresholds: usize) -> usize {
+    /// The requested pose and its room's name, and the errors.
+    const POSE: usize = 260;
+    POSE + 8 * latent_dim + 16 * thresholds
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::convert;
+    use super::*;
+    use prost::Message;
+    use seese3_core::geometry::Pose;
+
+    /// Oracle: the encoder, for the largest values of all fields.
+    #[test]
+    fn a_frame_is_no_larger_than_its_bound() {
+        let (name, room) = ("n".repeat(900), "r".repeat(100));
+        let pose = pb::Pose {
+            position: Some(pb::Vector3 {
+                x: -1.0,
+                y: -1.0,
+                z: -1.0,
+            }),
+            orientation: Some(pb::Quaternion {
+                w: -1.0,
+                x: -1.0,
+                y: -1.0,
+                z: -1.0,
+            }),
+            ..convert::pose_to_wire(&Pose::identity(), &room)
+        };
+        let frame = pb::RetrievedFrame {
+            frame_id: u32::MAX,
+            distance: -1.0,
+            pose: Some(pose),
+            frame_name: name.clone(),
+            timestamp_ns: Some(-1),
+        };
+        let frames = seese3_core::room::Frames {
+            poses: vec![Pose::identity()],
+            names: vec![name],
+            ..Default::default()
+        };
+        let id = seese3_core::room::RoomId::new(&room).unwrap();
+        let stored = Room::new(id, frames, Default::default()).unwrap();
+
+        let step = pb::NavigationStep {
+            frames: vec![frame],
+            ..Default::default()
+        };
+        assert!(
+            step.encoded_len() <= frame_bytes(&stored),
+            "{}",
+            step.encoded_len()
+        );
+    }
+
+    /// Oracle: the definition of the lanes.
+    #[test]
+    fn lanes_follow_the_cost() {
+        assert_eq!(lane(0, 20_000.0), Lane::Short);
+        assert_eq!(lane(0, 20_000.0 * 1_000.0), Lane::Long);
+        assert_eq!(lane(2, 20_000.0), Lane::Images);
+        assert_eq!(lane(3, 20_000.0), Lane::Long);
+    }
+}

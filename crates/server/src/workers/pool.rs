@@ -1,0 +1,236 @@
+//! Threads of one lane, shared between callers in time slices.
+
+use std::cell::RefCell;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use tokio::sync::oneshot;
+
+use super::super::caller::CallerId;
+use super::super::shares::{Exhausted, Share, Shares};
+use super::fair_queue::{FairQueue, Urgency};
+
+/// Time slice of a job while other jobs wait.
+const SLICE: Duration = Duration::from_millis(10);
+/// Maximum number of paused jobs of a lane. Each keeps a thread of the operating system.
+const MOST_PAUSED: usize = 64;
+
+thread_local! {
+    /// The turn of the job that runs on this thread.
+    static TURN: RefCell<Option<Turn>> = const { RefCell::new(None) };
+}
+
+/// The threads of a lane and its queue.
+#[derive(Debug, Clone)]
+pub struct Pool {
+    state: Arc<Mutex<State>>,
+    /// Places in the queue for requests, divided between callers. Frames of streams need none.
+    places: Arc<Shares>,
+}
+
+#[derive(Debug)]
+struct State {
+    free: usize,
+    /// Not empty only while no thread is free.
+    waiting: FairQueue<Waiting>,
+    paused: usize,
+    last_ticket: u64,
+}
+
+#[derive(Debug)]
+struct Waiting {
+    ticket: u64,
+    urgency: Urgency,
+    granted: oneshot::Sender<Turn>,
+}
+
+/// The right to use a thread. Dropping it passes the thread to the next job.
+#[derive(Debug)]
+pub struct Turn {
+    pool: Pool,
+    caller: CallerId,
+    urgency: Urgency,
+    began: Instant,
+    charged: Duration,
+    /// Whether the thread was passed on already.
+    is_over: bool,
+}
+
+/// Removes a waiting job from the queue if it is no longer wanted.
+struct Ticket<'a> {
+    pool: &'a Pool,
+    caller: &'a CallerId,
+    number: u64,
+}
+
+impl Drop for Ticket<'_> {
+    fn drop(&mut self) {
+        let mut state = self.pool.lock();
+        state
+            .waiting
+            .remove(self.caller, |waiting| waiting.ticket == self.number);
+    }
+}
+
+impl Pool {
+    /// A pool of `threads` with `places` for waiting requests.
+    pub fn new(threads: usize, places: usize) -> Self {
+        Self {
+            state: Arc::new(Mutex::new(State {
+                free: threads,
+                waiting: FairQueue::default(),
+                paused: 0,
+                last_ticket: 0,
+            })),
+            places: Shares::new(places),
+        }
+    }
+
+    /// Waits for a thread. A request is refused if its caller has no place left in the queue.
+    ///
+    /// # Errors
+    /// The limit that is reached.
+    pub async fn turn(&self, caller: &CallerId, urgency: Urgency) -> Result<Turn, Exhausted> {
+        let (granted, turn) = oneshot::channel();
+        let (ticket, _place) = {
+            let mut state = self.lock();
+            if state.free > 0 {
+                state.free -= 1;
+                let charged = state.waiting.start(caller);
+                return Ok(self.begin(caller.clone(), urgency, charged));
+            }
+
+            let place = self.place(caller, urgency)?;
+            (state.wait(caller, urgency, granted), place)
+        };
+
+        // If this future is dropped, the job leaves the queue.
+        let _ticket = Ticket {
+            pool: self,
+            caller,
+            number: ticket,
+        };
+        turn.await.map_err(|_| Exhausted::Budget)
+    }
+
+    fn place(&self, caller: &CallerId, urgency: Urgency) -> Result<Option<Share>, Exhausted> {
+        match urgency {
+            Urgency::Frame => Ok(None),
+            Urgency::Request => self.places.take(caller.clone(), 1).map(Some),
+        }
+    }
+
+    fn begin(&self, caller: CallerId, urgency: Urgency, charged: Duration) -> Turn {
+        Turn {
+            pool: self.clone(),
+            caller,
+            urgency,
+            began: Instant::now(),
+            charged,
+            is_over: false,
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Passes a thread to the next job that is still wanted.
+    fn pass_on(&self, state: &mut State) {
+        while let Some((caller, waiting, charged)) = state.waiting.pop() {
+            let turn = self.begin(caller, waiting.urgency, charged);
+            match waiting.granted.send(turn) {
+                Ok(()) => return,
+                Err(mut unwanted) => {
+                    unwanted.is_over = true;
+                    state
+                        .waiting
+                        .end(&unwanted.caller, Duration::ZERO, unwanted.charged);
+                }
+            }
+        }
+        state.free += 1;
+    }
+}
+
+impl State {
+    /// Adds a job to the queue; returns its ticket.
+    fn wait(&mut self, caller: &CallerId, urgency: Urgency, granted: oneshot::Sender<Turn>) -> u64 {
+        self.last_ticket += 1;
+        let ticket = self.last_ticket;
+        let waiting = Waiting {
+            ticket,
+            urgency,
+            granted,
+        };
+        self.waiting.push(caller, urgency, waiting);
+        ticket
+    }
+}
+
+impl Turn {
+    /// Runs `work` on this thread, paused by [`pause_if_others_wait`] when its slice is over.
+    pub fn run<T>(self, work: impl FnOnce() -> T) -> T {
+        /// Ends the turn also if the work panics.
+        struct End;
+        impl Drop for End {
+            fn drop(&mut self) {
+                drop(TURN.take());
+            }
+        }
+
+        TURN.set(Some(self));
+        let _end = End;
+        work()
+    }
+
+    /// Passes the thread on and waits for the next turn, if the slice is over and others wait.
+    /// Blocks the thread of the operating system meanwhile.
+    fn paused(mut self) -> Self {
+        let elapsed = self.began.elapsed();
+        if elapsed < SLICE {
+            return self;
+        }
+
+        let pool = self.pool.clone();
+        let mut state = pool.lock();
+        if state.waiting.is_empty() || state.paused >= MOST_PAUSED {
+            return self;
+        }
+
+        // The job is queued behind the others of its caller, so that they get turns too.
+        let (granted, turn) = oneshot::channel();
+        self.is_over = true;
+        state.waiting.end(&self.caller, elapsed, self.charged);
+        state.wait(&self.caller, self.urgency, granted);
+        state.paused += 1;
+        pool.pass_on(&mut state);
+        drop(state);
+
+        let turn = turn.blocking_recv();
+        pool.lock().paused -= 1;
+        // The sender is in the queue of `pool` until it sends.
+        turn.unwrap_or(self)
+    }
+}
+
+impl Drop for Turn {
+    fn drop(&mut self) {
+        if self.is_over {
+            return;
+        }
+        let pool = self.pool.clone();
+        let mut state = pool.lock();
+        let elapsed = self.began.elapsed();
+        state.waiting.end(&self.caller, elapsed, self.charged);
+        pool.pass_on(&mut state);
+    }
+}
+
+/// Lets waiting jobs of the lane run if the time slice of the job on this thread is over. Does
+/// nothing on other threads.
+pub fn pause_if_others_wait() {
+    if let Some(turn) = TURN.take() {
+        TURN.set(Some(turn.paused()));
+    }
+}
