@@ -141,8 +141,8 @@ pub struct Config {
     pub upload_bytes: usize,
     /// Maximum size of a received message, bytes.
     pub message_bytes: usize,
-    /// Worker threads for short requests, and as many for requests with images. Long requests, and
-    /// evaluations and fits, get half as many each, rounded up.
+    /// Worker threads for short requests, and as many for requests with images. Long requests
+    /// and evaluations get half as many each, rounded up; fits run one at a time.
     pub threads: usize,
     /// Maximum number of requests that wait for a thread, for each of these kinds; further ones are
     /// refused. Callers share these places.

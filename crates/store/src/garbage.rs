@@ -133,7 +133,10 @@ impl Store {
         let time = self.time().await?;
         let before = written_before(time, policy)?;
         let abandoned = match policy.publishers {
-            Publishers::Concurrent => time - ABANDONED_QUARANTINE,
+            // A full store without files has no time.
+            Publishers::Concurrent => time
+                .checked_sub_signed(ABANDONED_QUARANTINE)
+                .unwrap_or(DateTime::<Utc>::MIN_UTC),
             Publishers::None => time,
         };
         self.empty_quarantines(before, abandoned).await?;
