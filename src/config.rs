@@ -127,7 +127,7 @@ pub fn parse() -> anyhow::Result<Cli> {
         .get(1)
         .is_some_and(|name| name == "serve" || name == "config");
     if reads_file && let Some(file) = file_of(&arguments) {
-        let text = std::fs::read_to_string(&file)
+        let text = seese3_files::read_text(&file, seese3_files::SMALL_FILE_BYTES)
             .with_context(|| format!("--config: {} cannot be read", file.display()))?;
         let given = defaults(&file, &text)?;
 

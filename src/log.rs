@@ -78,7 +78,9 @@ pub fn start_log(format: LogFormat, traces: Option<&Traces>) -> Log {
     };
 
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| {
-        EnvFilter::new("info,hnsw_rs=warn,opentelemetry=warn,opentelemetry_sdk=warn")
+        // The server logs failed exports itself, once. OpenTelemetry would log each, with text of the
+        // collector of any length.
+        EnvFilter::new("info,hnsw_rs=warn,opentelemetry=off,opentelemetry_sdk=off,opentelemetry-otlp=off,opentelemetry_otlp=off")
     });
     // As no-color.org specifies, any non-empty NO_COLOR turns colors off.
     let no_colour = std::env::var_os("NO_COLOR").is_some_and(|set| !set.is_empty());

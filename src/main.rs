@@ -70,7 +70,11 @@ fn main() -> ExitCode {
         }
     };
 
-    let runtime = match tokio::runtime::Runtime::new() {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .max_blocking_threads(seese3_server::MAX_BLOCKING_THREADS)
+        .build();
+    let runtime = match runtime {
         Ok(runtime) => runtime,
         Err(error) => {
             complain(&format_args!("cannot start the async runtime: {error}"));
@@ -107,6 +111,7 @@ fn with_causes(error: &anyhow::Error) -> String {
 /// Prints an error to standard error. A failed write is ignored, because `eprintln` would panic;
 /// the exit code still reports the failure.
 fn complain(error: &dyn std::fmt::Display) {
+    let error = output::printable(&error.to_string());
     let _ = writeln!(std::io::stderr(), "error: {error}");
 }
 

@@ -286,7 +286,8 @@ fn matrix_rows(similarity: &Similarity) -> Vec<Vec<f64>> {
 /// A similarity from a text file of 16 numbers.
 fn read_similarity(file: &Path) -> anyhow::Result<Similarity> {
     let shown = file.display();
-    let text = std::fs::read_to_string(file).with_context(|| format!("{shown} cannot be read"))?;
+    let text = seese3_files::read_text(file, seese3_files::SMALL_FILE_BYTES);
+    let text = text.with_context(|| format!("{shown} cannot be read"))?;
     let numbers = text
         .split_whitespace()
         .map(str::parse)

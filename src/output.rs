@@ -8,6 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context;
 use clap::Args;
+use seese3_client::one_line;
 use serde::Serialize;
 
 /// Whether text output is turned off. A static, because standard output belongs to the process.
@@ -124,11 +125,23 @@ pub fn is_silent() -> bool {
     IS_SILENT.load(Ordering::Relaxed)
 }
 
-/// Prints a line to standard output.
+/// Prints a line, or several, to standard output. Control characters within a line are left out: the
+/// text may come from a server.
 pub fn say(line: impl std::fmt::Display) {
     if !is_silent() {
-        print(format!("{line}\n").as_bytes());
+        print(format!("{}\n", printable(&line.to_string())).as_bytes());
     }
+}
+
+/// The text without control characters, apart from tabs and the ends of lines.
+pub fn printable(text: &str) -> String {
+    let cells = |line: &str| {
+        line.split('\t')
+            .map(one_line)
+            .collect::<Vec<_>>()
+            .join("\t")
+    };
+    text.split('\n').map(cells).collect::<Vec<_>>().join("\n")
 }
 
 /// Writes to standard output. The first write error is kept for [`check_printed`], and the command

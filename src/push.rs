@@ -8,6 +8,7 @@ use sha2::{Digest, Sha256};
 use super::ask::Server;
 use super::output::say;
 use super::store_option::StoreAndJson;
+use seese3_client::Client;
 use seese3_client::proto::v1 as pb;
 use seese3_core::features::Features;
 use seese3_core::geometry::Pose;
@@ -59,14 +60,16 @@ impl Push {
                 let stored = store.load_room(&self.name.name, self.name.revision).await?;
                 has_keypoints = stored.keypoints.is_some();
                 let messages = room_messages(&stored, self.upload(&stored, &target)?)?;
-                let answer = client.create_room(tokio_stream::iter(messages)).await?;
+                let answer = client.create_room(tokio_stream::iter(messages)).await;
+                let answer = answer.map_err(unanswered)?;
                 (answer.revision, answer.created, answer.served)
             }
             Kind::Adapter => {
                 let files = store.adapter_files(&self.name.name, self.name.revision);
                 let (manifest, weights) = files.await?;
                 let messages = adapter_messages(manifest, &weights, &target, self.validate_only);
-                let answer = client.publish_adapter(tokio_stream::iter(messages)).await?;
+                let answer = client.publish_adapter(tokio_stream::iter(messages)).await;
+                let answer = answer.map_err(unanswered)?;
                 (answer.revision, answer.created, answer.served)
             }
         };
@@ -99,16 +102,7 @@ impl Push {
 
         let mut fitted_adapter = None;
         if self.refit {
-            let request = pb::RefitRoomRequest {
-                name: target.to_string(),
-                ..pb::RefitRoomRequest::default()
-            };
-            let fitted = client.refit_room(request, |_| ()).await?.revision;
-            let fitted = fitted.unwrap_or_default();
-            say(format_args!(
-                "adapters/{}/revisions/{}: fitted to the room",
-                fitted.name, fitted.revision
-            ));
+            let fitted = refitted(&client, &target).await?;
             fitted_adapter = Some(json!({ "name": fitted.name, "revision": fitted.revision }));
         }
 
@@ -155,6 +149,34 @@ impl Push {
             ..pb::RoomUpload::default()
         })
     }
+}
+
+/// Lets the server fit an adapter to a room.
+async fn refitted(client: &Client, room: &ResourceName) -> anyhow::Result<pb::Revision> {
+    let request = pb::RefitRoomRequest {
+        name: room.to_string(),
+        ..pb::RefitRoomRequest::default()
+    };
+    let fitted = client.refit_room(request, |_| ()).await?.revision;
+    let fitted = fitted.unwrap_or_default();
+    say(format_args!(
+        "adapters/{}/revisions/{}: fitted to the room",
+        fitted.name, fitted.revision
+    ));
+    Ok(fitted)
+}
+
+/// Says what may have happened to an upload without a response.
+fn unanswered(error: seese3_client::Error) -> anyhow::Error {
+    let is_late = matches!(error, seese3_client::Error::Deadline);
+    let error = anyhow::Error::from(error);
+    if !is_late {
+        return error;
+    }
+    error.context(
+        "the server may still publish it; push it again, with a longer --deadline: what is there already is not \
+         published twice",
+    )
 }
 
 /// The description of a room's keypoints.

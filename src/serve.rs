@@ -15,8 +15,8 @@ use super::output::say;
 use seese3_core::navigation::{IndexKind, Limits};
 use seese3_encoder::{Bounds, Runtime, RuntimeKind};
 use seese3_server::{
-    Config, ImageEncoders, Keyring, Listeners, Reload, RoomMemory, Tls, TlsFiles, TokenKey, run,
-    shutdown_signal,
+    Config, ImageEncoders, Keyring, Listeners, Quota, Reload, RoomMemory, Tls, TlsFiles, TokenKey,
+    run, shutdown_signal,
 };
 use seese3_store::Store;
 
@@ -123,6 +123,14 @@ pub struct Serve {
     /// pixels in width. Images are read from the room's original folder
     #[arg(long, env = "SEESE3_THUMBNAILS")]
     thumbnails: bool,
+    /// Maximum number of stored revisions of a room and the adapters named after it; no limit if
+    /// omitted
+    #[arg(long, env = "SEESE3_MAX_STORED_REVISIONS", value_parser = clap::value_parser!(u64).range(1..))]
+    max_stored_revisions: Option<u64>,
+    /// Size of a room and the adapters named after it in the store, bytes, from which on changes are
+    /// refused; no limit if omitted
+    #[arg(long, env = "SEESE3_MAX_STORED_BYTES", value_parser = clap::value_parser!(u64).range(1..))]
+    max_stored_bytes: Option<u64>,
     /// Memory limit of all uploads in progress, 1048576 to 1099511627776 bytes
     #[arg(long, env = "SEESE3_MAX_UPLOAD_BYTES", default_value_t = Config::default().upload_bytes, value_parser = bounded(1 << 20, 1 << 40))]
     max_upload_bytes: usize,
@@ -155,13 +163,13 @@ pub struct Serve {
     /// and tokens are invalid after the server stops
     #[arg(long, value_name = "FILE", env = "SEESE3_TOKEN_KEY_FILE")]
     token_key_file: Option<PathBuf>,
-    /// Threads of each of three pools, 1 to 1024: short requests, requests with images, and
-    /// batches, evaluations and fits, which get half as many, rounded up. Also the number of
+    /// Threads for short requests, and as many for requests with one or two images, 1 to 1024. Long
+    /// requests and evaluations get half as many each, rounded up; fits have one. Also the number of
     /// threads of an onnxruntime session. The number of cores if omitted
     #[arg(long, env = "SEESE3_THREADS", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
-    /// Maximum number of waiting requests in each thread pool (see --threads), 0 to 1000000;
-    /// further ones are refused
+    /// Maximum number of waiting requests of each of these kinds, 0 to 1000000; further ones are
+    /// refused
     #[arg(long, env = "SEESE3_QUEUE", default_value_t = Config::default().queue, value_parser = bounded(0, 1_000_000))]
     queue: usize,
     /// Format of the log, which goes to standard error; RUST_LOG filters it
@@ -373,6 +381,10 @@ impl Serve {
             memory_bytes: self.max_memory_bytes,
             writable: self.writable,
             thumbnails: self.thumbnails,
+            room_quota: Quota {
+                revisions: self.max_stored_revisions,
+                bytes: self.max_stored_bytes,
+            },
             upload_bytes: self.max_upload_bytes,
             message_bytes: self.max_message_bytes,
             threads,
@@ -446,7 +458,7 @@ impl Serve {
         let Some(file) = &self.token_key_file else {
             return Ok(TokenKey::random());
         };
-        let secret = std::fs::read(file)
+        let secret = seese3_files::read(file, seese3_files::SMALL_FILE_BYTES)
             .with_context(|| format!("--token-key-file: {} cannot be read", file.display()))?;
 
         TokenKey::new(&secret)

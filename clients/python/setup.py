@@ -33,6 +33,7 @@ SYNCHRONOUS = [
     (r"^import asyncio$", "import queue\nimport time"),
     (r"\basyncio\.sleep\b", "time.sleep"),
     (r"\bchannel\.open_async\b", "channel.open_sync"),
+    (r"\bchannel\.AsyncTimer\b", "channel.SyncTimer"),
     (r"\baclose\b", "close"),
 ]
 

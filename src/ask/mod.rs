@@ -34,7 +34,8 @@ pub struct Server {
     /// The server's address, HOST:PORT
     #[arg(long, env = "SEESE3_SERVER", default_value = "127.0.0.1:50051")]
     server: String,
-    /// Deadline of each call, seconds, 1 to 86400; for a stream (`track`), only of opening it
+    /// Deadline of each call, seconds, 1 to 86400; for `track`, only of opening the stream; for `push`,
+    /// the longest time without progress
     #[arg(long, default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     deadline: u64,
     /// File with the authentication token for the server
@@ -55,7 +56,7 @@ impl Server {
     /// Connects to the server. The deadline applies to every later call.
     pub async fn connect(&self) -> anyhow::Result<Client> {
         let read = |option: &str, file: &PathBuf| {
-            std::fs::read(file)
+            seese3_files::read(file, seese3_files::SMALL_FILE_BYTES)
                 .with_context(|| format!("{option}: {} cannot be read", file.display()))
         };
 
@@ -216,7 +217,8 @@ fn feature_view(file: &Path, row: usize) -> anyhow::Result<pb::View> {
 }
 
 fn image_view(file: &Path) -> anyhow::Result<pb::View> {
-    let bytes = std::fs::read(file).with_context(|| file.display().to_string())?;
+    let bytes = seese3_files::read(file, seese3_files::IMAGE_FILE_BYTES);
+    let bytes = bytes.with_context(|| file.display().to_string())?;
     Ok(pb::View {
         view: Some(pb::view::View::Image(bytes)),
     })

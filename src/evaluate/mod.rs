@@ -41,7 +41,7 @@ use seese3_lab::report::{
     AdapterJson, EvaluationContext, MotionBaselines, RoomJson, baselines_text, curve_thresholds,
     evaluation_csv, evaluation_json, evaluation_latex, evaluation_table, hit_curves, report_at,
 };
-use seese3_store::{Store, StoredAdapter, StoredRoom};
+use seese3_store::{ResourceName, Store, StoredAdapter, StoredRoom};
 
 #[derive(Debug, Args)]
 #[command(args_conflicts_with_subcommands = true)]
@@ -419,6 +419,8 @@ async fn choose(
         return Ok(store.load_adapter(name, None).await?);
     }
 
+    // A room that is not there is reported before advice to train on it.
+    store.contents_of(&ResourceName::room(&wanted.room)).await?;
     let names = store.adapter_names().await?;
     let mut fitting = Vec::new();
     for name in &names {

@@ -199,7 +199,8 @@ fn read_parameters(file: &Path) -> anyhow::Result<FilterParameters> {
         parameters: FilterParameters,
     }
     let shown = file.display();
-    let bytes = std::fs::read(file).with_context(|| format!("{shown} cannot be read"))?;
+    let bytes = seese3_files::read(file, seese3_files::SMALL_FILE_BYTES);
+    let bytes = bytes.with_context(|| format!("{shown} cannot be read"))?;
     let fitted: Fitted = serde_json::from_slice(&bytes)
         .with_context(|| format!("{shown} is no file of `seese3 fit-tracking --json`"))?;
     let checked = fitted.parameters.check();

@@ -43,7 +43,7 @@ pub fn recorded(heard: &ReceivedAnswers, seen: &[RecordedView]) -> anyhow::Resul
             .unwrap_or(usize::MAX)
             .saturating_sub(1);
         if let Some(RecordedView::Image(file)) = seen.get(row) {
-            let image = std::fs::read(file)
+            let image = seese3_files::read(file, seese3_files::IMAGE_FILE_BYTES)
                 .with_context(|| format!("{} cannot be read", file.display()))?;
             recording.image(time, &names.camera, &image)?;
         }

@@ -13,10 +13,10 @@ use crate::ask::{Server, ViewCamera, wire_json};
 use crate::camera::CAMERA_FORM;
 use crate::output::{JsonOutput, check_writable, say, write_file};
 use crate::progress::bar;
-use seese3_client::convert;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::track_request::Message;
 use seese3_client::proto::v1::track_response::Answer;
+use seese3_client::{convert, one_line};
 use seese3_core::geometry::Pose;
 use seese3_data::datasets::read_features;
 use seese3_data::export::tum_trajectory;
@@ -85,6 +85,13 @@ struct ReceivedAnswers {
     refusals: Vec<pb::TrackRefusal>,
     names: pb::FrameNames,
     token: Vec<u8>,
+}
+
+impl ReceivedAnswers {
+    /// Number of answers to frames.
+    fn answered(&self) -> usize {
+        self.updates.len() + self.refusals.len()
+    }
 }
 
 impl Track {
@@ -160,11 +167,19 @@ impl Track {
         loop {
             let answer = match answers.message().await {
                 Ok(Some(answer)) => answer,
+                Ok(None) if heard.answered() < end - from => {
+                    ended = Err(anyhow::anyhow!(
+                        "the stream ended after answers to {} of {} frames",
+                        heard.answered(),
+                        end - from
+                    ));
+                    break;
+                }
                 Ok(None) => break,
                 // Keep the answers received so far: with the last token, another server can
                 // continue the stream.
                 Err(status) => {
-                    ended = Err(seese3_client::Error::from(status));
+                    ended = Err(seese3_client::Error::from(status).into());
                     break;
                 }
             };
@@ -191,6 +206,12 @@ impl Track {
                 _ => {}
             }
 
+            if heard.answered() > end - from {
+                ended = Err(anyhow::anyhow!(
+                    "the server answered more frames than were sent"
+                ));
+                break;
+            }
             progress.inc(1);
         }
 
@@ -249,7 +270,7 @@ impl Track {
 
     fn config(&self) -> anyhow::Result<pb::TrackConfig> {
         if let Some(file) = &self.resume {
-            let resume_token = std::fs::read(file)
+            let resume_token = seese3_files::read(file, seese3_files::SMALL_FILE_BYTES)
                 .with_context(|| format!("{} cannot be read", file.display()))?;
             if resume_token.is_empty() {
                 bail!("{} is empty; it needs a resume token", file.display());
@@ -311,8 +332,8 @@ impl Track {
                 // Sequence numbers start at 1, rows of the input at 0.
                 say(format_args!(
                     "frame {}: {status}{place}: {}",
-                    update.sequence - 1,
-                    update.reason
+                    update.sequence.saturating_sub(1),
+                    one_line(&update.reason)
                 ));
 
                 before = Some(update.status());
@@ -352,7 +373,14 @@ impl Track {
             write_file(file, &mcap::recorded(heard, seen)?)?;
             say(format_args!("wrote {}", file.display()));
         }
-        if let Some(file) = &self.save_token {
+        if let Some(file) = &self.save_token
+            && heard.token.is_empty()
+        {
+            say(format_args!(
+                "no resume token came; {} is unchanged",
+                file.display()
+            ));
+        } else if let Some(file) = &self.save_token {
             write_file(file, &heard.token)?;
             say(format_args!("wrote {}", file.display()));
         }
@@ -376,7 +404,10 @@ impl RecordedView {
                 values: values.clone(),
                 source_name: String::new(),
             })),
-            Self::Image(file) => std::fs::read(file).ok().map(pb::view::View::Image),
+            Self::Image(file) => {
+                let bytes = seese3_files::read(file, seese3_files::IMAGE_FILE_BYTES).ok();
+                bytes.map(pb::view::View::Image)
+            }
         }
     }
 }

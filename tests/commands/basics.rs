@@ -207,6 +207,10 @@ fn bad_input_gets_one_line() {
     );
 
     here.refuses(evaluate, &["no adapter was trained on room 'r'"]);
+    here.refuses(
+        "evaluate --store store --room NOPE",
+        &["room 'NOPE'", "it has r"],
+    );
     here.succeeds(&format!("{train} --epochs 1"));
     here.refuses(&format!("{evaluate} --thresholds 0.1,0"), &["threshold 0"]);
     here.refuses(&format!("{evaluate} --split pairs"), &["this split"]);

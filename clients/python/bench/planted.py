@@ -131,7 +131,8 @@ def mirror(image: Path, to: Path) -> None:
 
 
 def link(image: Path, to: Path) -> None:
-    to.symlink_to(image.resolve())
+    # A link that leads out of the folder is refused; a hard link is a file of it.
+    to.hardlink_to(image)
 
 
 def main() -> None:

@@ -44,6 +44,7 @@ from .answers import (
 from .channel import Tls
 from .client import Client, Track
 from .errors import (
+    AnswerError,
     BusyError,
     CommandError,
     ConflictError,
@@ -78,6 +79,7 @@ from .views import Feature, Latent, View
 __version__ = "0.1.0"
 
 __all__ = [
+    "AnswerError",
     "Adapter",
     "AsyncClient",
     "AsyncNewest",

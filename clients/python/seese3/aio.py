@@ -44,6 +44,10 @@ from .views import View, wire_view
 # How often and how soon a cut tracking stream is opened again.
 RESUMPTIONS = 5
 FIRST_WAIT_S = 0.1
+# Frames since the last token that are kept, to send them again when a stream is cut.
+MOST_UNSAVED = 1_000
+# Pages of a list; a server's page has up to 1,000 entries.
+MOST_PAGES = 10_000
 
 
 class AsyncClient:
@@ -98,9 +102,12 @@ class AsyncClient:
     async def _ask(self, method: Any, request: Any, deadline_s: float | None) -> Any:
         self._check_open()
         try:
-            return await method(request, timeout=self._timeout(deadline_s), metadata=self._metadata)
+            answer = await method(request, timeout=self._timeout(deadline_s), metadata=self._metadata)
         except grpc.RpcError as error:
             raise errors.refused(error) from None
+        if answer is None:
+            raise errors.AnswerError("the server answered without a message")
+        return answer
 
     def _check_open(self) -> None:
         if self._is_closed:
@@ -328,11 +335,17 @@ class AsyncClient:
         return answers.Encoding.of(await self._ask(self._odometry.Encode, request, deadline_s), with_features)
 
     def track(
-        self, config: TrackConfig | None = None, *, resume_token: bytes = b"", last_sequence: int | None = None
+        self,
+        config: TrackConfig | None = None,
+        *,
+        resume_token: bytes = b"",
+        last_sequence: int | None = None,
+        deadline_s: float | None = None,
     ) -> AsyncTrack:
         """Opens a stream that follows a camera: `async with client.track(TrackConfig(room="kitchen")) as track`.
 
-        To go on with a stream of another program, give its `resume_token` and its `last_sequence`.
+        To go on with a stream of another program, give its `resume_token` and its `last_sequence`. The deadline is
+        that of opening the stream, the first time and when it was cut; `step` has its own.
         """
         self._check_open()
         if (config is None) == (not resume_token):
@@ -340,7 +353,7 @@ class AsyncClient:
         if bool(resume_token) != (last_sequence is not None):
             raise ValueError("resume_token and last_sequence belong together: frames go on with the number after it")
         message = config.message() if config else odometry_pb2.TrackConfig(resume_token=resume_token)
-        return AsyncTrack(self._odometry.Track, self._metadata, message, last_sequence or 0)
+        return AsyncTrack(self._odometry.Track, self._metadata, message, last_sequence or 0, self._timeout(deadline_s))
 
     # Evaluation.
 
@@ -438,13 +451,14 @@ class AsyncClient:
 
     async def _pages(self, method: str, field: str, deadline_s: float | None) -> AsyncIterator[Any]:
         request = getattr(catalog_pb2, f"{method}Request")()
-        while True:
+        for _ in range(MOST_PAGES):
             page = await self._ask(getattr(self._catalog, method), request, deadline_s)
             for entry in getattr(page, field):
                 yield entry
             if not page.next_page_token:
                 return
-            request.page_token = page.next_page_token
+            _go_on(request, page.next_page_token)
+        raise errors.AnswerError(f"the server's list has more than {MOST_PAGES} pages")
 
     async def room(self, name: str, *, deadline_s: float | None = None) -> Room:
         """One room."""
@@ -469,14 +483,15 @@ class AsyncClient:
             room=room, neighbours_within=neighbours_within, thumbnail_width=thumbnail_width
         )
         frames: list[catalog_pb2.RoomFrame] = []
-        while True:
+        for _ in range(MOST_PAGES):
             page = await self._ask(self._catalog.ListFrames, request, deadline_s)
             frames.extend(page.frames)
             if not page.next_page_token:
                 with_neighbours = neighbours_within is not None
                 with_thumbnails = thumbnail_width is not None
                 return answers.RoomFrames.of(page.room, frames, with_neighbours, with_thumbnails)
-            request.page_token = page.next_page_token
+            _go_on(request, page.next_page_token)
+        raise errors.AnswerError(f"the server's list has more than {MOST_PAGES} pages")
 
     async def create_room(
         self,
@@ -637,11 +652,11 @@ def _stub(kind: Any, channel: Any) -> Any:
     return kind(channel)
 
 
-def _answered(answer: odometry_pb2.TrackResponse) -> TrackUpdate | TrackRefusal:
-    """What a stream says of a frame."""
-    if answer.HasField("refusal"):
-        return TrackRefusal.of(answer.refusal)
-    return TrackUpdate.of(answer.update)
+def _go_on(request: Any, token: str) -> None:
+    """Asks for the next page."""
+    if token == request.page_token:
+        raise errors.AnswerError("the server's list has no end: a page is followed by itself")
+    request.page_token = token
 
 
 def _resource(collection: str, name: str, revision: int | None = None) -> str:
@@ -661,14 +676,20 @@ class AsyncTrack:
     """
 
     def __init__(
-        self, method: Any, metadata: list[tuple[str, str]], config: odometry_pb2.TrackConfig, last_sequence: int
+        self,
+        method: Any,
+        metadata: list[tuple[str, str]],
+        config: odometry_pb2.TrackConfig,
+        last_sequence: int,
+        deadline_s: float | None,
     ) -> None:
         self._method = method
+        self._deadline_s = deadline_s
         self._metadata = metadata
         self._config = config
         self.last_sequence = last_sequence
         # What was answered since the last token, and what has no answer yet: both are sent again when a stream is cut.
-        self._unsaved: deque[odometry_pb2.TrackRequest] = deque()
+        self._unsaved: deque[odometry_pb2.TrackRequest] = deque(maxlen=MOST_UNSAVED)
         self._awaited: deque[odometry_pb2.TrackRequest] = deque()
         self._call: Any = None
         self._is_cut = False
@@ -710,16 +731,21 @@ class AsyncTrack:
         inertial: InertialSamples | None = None,
         exposure_ns: int = 0,
         depth: DepthImage | None = None,
+        deadline_s: float | None = None,
     ) -> TrackUpdate | TrackRefusal:
         """Sends a frame, taken at a time on the camera's clock, and returns what the server says of it.
 
         `inertial` are the samples since the last frame. `exposure_ns` is the duration of the exposure, which begins at
         the time. `depth` are the depths of an image, from a depth camera or stereo.
 
-        A step that raises, or that is given up, did not happen: the frame may be sent again.
+        Without `deadline_s`, a step waits for as long as the connection is alive. A stream that was cut is opened again
+        within the deadline of opening it. A step that raises, or that is given
+        up, did not happen: the frame may be sent again.
         """
         frame = self._frame(view, timestamp_ns, sequence, odometry, gravity, other_views, inertial, exposure_ns, depth)
-        return _answered(await self._exchange(frame))
+        await self._drain()
+        await self._send(frame)
+        return await self._receive(channel.timeout(deadline_s))
 
     async def follow(
         self, frames: AsyncIterable[tuple[int, View]], *, ahead: int = 0
@@ -738,16 +764,16 @@ class AsyncTrack:
         async for timestamp_ns, view in frames:
             await self._send(self._frame(view, timestamp_ns))
             if len(self._awaited) > ahead:
-                yield _answered(await self._receive())
+                yield await self._receive()
         while self._awaited:
-            yield _answered(await self._receive())
+            yield await self._receive()
 
     async def set_initial_pose(self, pose: InitialPose) -> None:
         """Tells where the camera is now."""
         message = odometry_pb2.SetInitialPose(initial_pose=pose.message())
-        answer = await self._exchange(odometry_pb2.TrackRequest(set_initial_pose=message))
-        if answer.HasField("refusal"):
-            raise errors.InvalidFieldError(answer.refusal.message, code="INVALID_ARGUMENT", reason="POSE")
+        refusal = await self._exchange(odometry_pb2.TrackRequest(set_initial_pose=message))
+        if refusal is not None:
+            raise errors.InvalidFieldError(refusal.message, code="INVALID_ARGUMENT", reason="POSE")
 
     async def reset(self) -> None:
         """Starts anew: the camera has to be found again."""
@@ -764,12 +790,12 @@ class AsyncTrack:
 
         config = odometry_pb2.TrackConfig(resume_token=self.resume_token) if self.resume_token else self._config
         await self._requests.put(odometry_pb2.TrackRequest(config=config))
-        answer = await self._next_answer()
+        answer = await self._next_answer(self._deadline_s)
         self.start = TrackStart.of(answer.started)
         self.resume_token = answer.resume_token or self.resume_token
         for request in list(self._unsaved):
             await self._requests.put(request)
-            await self._next_answer()
+            await self._next_answer(self._deadline_s)
         self._is_cut = False
 
     async def _outgoing(
@@ -778,13 +804,21 @@ class AsyncTrack:
         while (request := await queue.get()) is not None:
             yield request
 
-    async def _next_answer(self) -> odometry_pb2.TrackResponse:
+    async def _next_answer(self, deadline_s: float | None) -> odometry_pb2.TrackResponse:
+        timer = channel.AsyncTimer(self._call, deadline_s)
         try:
             answer: odometry_pb2.TrackResponse = await anext(self._answers)
         except StopAsyncIteration:
             raise errors.UnavailableError("the server ended the stream", code="UNAVAILABLE") from None
-        except grpc.RpcError as error:
-            raise errors.refused(error) from None
+        except (grpc.RpcError, channel.CancelledError) as error:
+            if timer.is_over:
+                message = "the server did not answer within the deadline"
+                raise errors.DeadlineError(message, code="DEADLINE_EXCEEDED") from None
+            if isinstance(error, grpc.RpcError):
+                raise errors.refused(error) from None
+            raise
+        finally:
+            timer.stop()
         return answer
 
     def _note(self, answer: odometry_pb2.TrackResponse) -> None:
@@ -811,13 +845,15 @@ class AsyncTrack:
         self.last_sequence = number
         return frame
 
-    async def _exchange(self, request: odometry_pb2.TrackRequest) -> odometry_pb2.TrackResponse:
+    async def _exchange(self, request: odometry_pb2.TrackRequest) -> TrackRefusal | None:
+        """Sends what is no frame; returns what the server refuses of it."""
         await self._drain()
         await self._send(request)
-        return await self._receive()
+        said = await self._receive()
+        return said if isinstance(said, TrackRefusal) else None
 
     async def _drain(self) -> None:
-        """Takes the answers that a `follow` left behind which was left before its end."""
+        """Receives the answers left over from a `follow` that was left early."""
         while self._awaited:
             await self._receive()
 
@@ -829,13 +865,14 @@ class AsyncTrack:
         self._awaited.append(request)
         await self._requests.put(request)
 
-    async def _receive(self) -> odometry_pb2.TrackResponse:
-        """The answer to the oldest request that has none yet."""
+    async def _receive(self, deadline_s: float | None = None) -> TrackUpdate | TrackRefusal:
+        """What the server says of the oldest request that has no answer yet."""
         if self._is_busy:
             raise errors.SeeseError("the stream waits for an answer already: one stream is for one thread or task")
         self._is_busy = True
         try:
-            answer = await self._answer()
+            answer = await self._answer(deadline_s)
+            said = self._understood(answer)
         except BaseException:
             # Whoever waited may have given up, by a timeout of its own or by Ctrl-C, and an answer that came later
             # would be taken for that of the next frame. So the stream is cut: what has no answer did not happen.
@@ -852,7 +889,18 @@ class AsyncTrack:
         for _ in range(min(answered, len(self._awaited))):
             self._unsaved.append(self._awaited.popleft())
         self._note(answer)
-        return answer
+        return said
+
+    def _understood(self, answer: odometry_pb2.TrackResponse) -> TrackUpdate | TrackRefusal:
+        """What an answer says; it has to be that of the oldest request without one."""
+        if answer.HasField("refusal"):
+            return TrackRefusal.of(answer.refusal)
+        asked, update = self._awaited[0], answer.update
+        if asked.HasField("frame") and update.sequence != asked.frame.sequence:
+            raise errors.AnswerError(
+                f"the server answered frame {update.sequence} where frame {asked.frame.sequence} was sent"
+            )
+        return TrackUpdate.of(update)
 
     def _forget_awaited(self) -> None:
         # A number that is never sent would count as a frame that is missing.
@@ -861,9 +909,9 @@ class AsyncTrack:
                 self.last_sequence = request.frame.sequence - 1
         self._awaited.clear()
 
-    async def _answer(self) -> odometry_pb2.TrackResponse:
+    async def _answer(self, deadline_s: float | None) -> odometry_pb2.TrackResponse:
         try:
-            return await self._next_answer()
+            return await self._next_answer(deadline_s)
         except errors.UnavailableError:
             answer: odometry_pb2.TrackResponse = await self._keep_trying(self._answer_again)
             return answer
@@ -876,7 +924,7 @@ class AsyncTrack:
         await self._open_again()
         for request in self._awaited:
             await self._requests.put(request)
-        return await self._next_answer()
+        return await self._next_answer(self._deadline_s)
 
     async def _keep_trying(self, what: Callable[[], Any]) -> Any:
         wait_s = FIRST_WAIT_S

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import errors
+from .errors import understood
 from .geometry import Array, covariance_matrix, pose_matrix, twist_vector
 from .v1 import catalog_pb2, evaluation_pb2, geometry_pb2, localization_pb2, navigation_pb2, odometry_pb2
 from .views import Feature, Latent
@@ -32,7 +33,11 @@ def _known(message: Any, field: str) -> Any:
 
 def _word(enum: Any, value: int, prefix: str) -> str:
     """A value of an enum as a word: TRACK_STATUS_LOST is "lost"."""
-    name: str = enum.Name(value)
+    try:
+        name: str = enum.Name(value)
+    except ValueError:
+        # Of a server that is newer than this package.
+        return f"unknown_{value}"
     return name.removeprefix(prefix).lower()
 
 
@@ -44,6 +49,7 @@ class Revision:
     revision: int
 
     @classmethod
+    @understood
     def of(cls, message: geometry_pb2.Revision) -> Revision:
         return cls(message.name, message.revision)
 
@@ -62,6 +68,7 @@ class PoseError:
     within: dict[float, bool]
 
     @classmethod
+    @understood
     def of(cls, message: Any, field: str) -> PoseError | None:
         if not message.HasField(field):
             return None
@@ -81,6 +88,7 @@ class Frame:
     timestamp_ns: int | None
 
     @classmethod
+    @understood
     def of(cls, message: geometry_pb2.RetrievedFrame) -> Frame:
         return cls(
             message.frame_id,
@@ -105,6 +113,7 @@ class FeatureSource:
     norm: str = "unspecified"
 
     @classmethod
+    @understood
     def of(cls, message: catalog_pb2.FeatureSource) -> FeatureSource:
         fields = cls.__dataclass_fields__
         return cls(**{name: getattr(message, name) for name in fields})
@@ -148,6 +157,7 @@ class Camera:
         object.__setattr__(self, "distortion", tuple(map(float, self.distortion)))
 
     @classmethod
+    @understood
     def of(cls, message: geometry_pb2.CameraIntrinsics) -> Camera:
         has_model = message.distortion_model != geometry_pb2.DISTORTION_MODEL_UNSPECIFIED
         return cls(
@@ -181,6 +191,7 @@ class Room:
         return self.revision.name
 
     @classmethod
+    @understood
     def of(cls, message: catalog_pb2.Room) -> Room:
         return cls(
             Revision.of(message.revision),
@@ -208,6 +219,7 @@ class MotionScores:
     still_components: int
 
     @classmethod
+    @understood
     def of(cls, message: catalog_pb2.MotionScores) -> MotionScores:
         return cls(
             n=message.n,
@@ -250,6 +262,7 @@ class Adapter:
         return self.revision.name
 
     @classmethod
+    @understood
     def of(cls, message: catalog_pb2.Adapter) -> Adapter:
         return cls(
             revision=Revision.of(message.revision),
@@ -292,6 +305,7 @@ class RoomFrames:
         return len(self.poses)
 
     @classmethod
+    @understood
     def of(
         cls,
         room: geometry_pb2.Revision,
@@ -328,6 +342,7 @@ class Publication:
     served: bool
 
     @classmethod
+    @understood
     def of(cls, message: Any) -> Publication:
         return cls(_revision(message, "revision"), message.created, message.served)
 
@@ -345,6 +360,7 @@ class Default:
     adapter: str | None
 
     @classmethod
+    @understood
     def of(cls, message: catalog_pb2.Default) -> Default:
         collection, _, name = message.name.partition("/")
         adapter = message.adapter.removeprefix("adapters/") or None
@@ -363,6 +379,7 @@ class KeypointMatches:
     frame_ids: tuple[int, ...]
 
     @classmethod
+    @understood
     def of(cls, message: Any) -> KeypointMatches | None:
         if not message.HasField("matches"):
             return None
@@ -383,6 +400,7 @@ class FittedEstimate:
     rotation_gain: float
 
     @classmethod
+    @understood
     def of(cls, message: Any) -> FittedEstimate | None:
         if not message.HasField("fitted"):
             return None
@@ -421,6 +439,7 @@ class Localization:
     room_count: int
 
     @classmethod
+    @understood
     def of(cls, message: localization_pb2.LocalizeResponse) -> Localization:
         places = tuple(
             Place(Revision.of(place.room), Frame.of(place.frame), PoseError.of(place, "error"))
@@ -470,6 +489,7 @@ class RoomMatch:
     frames: tuple[Frame, ...]
 
     @classmethod
+    @understood
     def of(cls, message: localization_pb2.RoomMatch) -> RoomMatch:
         return cls(
             Revision.of(message.room),
@@ -496,6 +516,7 @@ class Relocalization:
     reason: str | None
 
     @classmethod
+    @understood
     def of(cls, message: localization_pb2.RelocalizeResponse) -> Relocalization:
         return cls(
             Revision.of(message.adapter) if message.HasField("adapter") else None,
@@ -518,6 +539,7 @@ class Step:
     latent: Latent
 
     @classmethod
+    @understood
     def of(cls, message: navigation_pb2.NavigationStep) -> Step:
         return cls(
             message.step,
@@ -556,6 +578,7 @@ class Navigation:
         return Frame.of(self._message.steps[-1].frames[0])
 
     @classmethod
+    @understood
     def of(cls, message: navigation_pb2.NavigateResponse) -> Navigation:
         return cls(
             Revision.of(message.room),
@@ -593,6 +616,7 @@ class WayStep:
     out_of_distribution: float | None
 
     @classmethod
+    @understood
     def of(cls, message: navigation_pb2.NavigateToFeedback) -> WayStep:
         start = message.start if message.HasField("start") else None
         return cls(
@@ -621,6 +645,7 @@ class Way:
     arrival_probability: float | None
 
     @classmethod
+    @understood
     def of(cls, steps: Iterable[WayStep], message: navigation_pb2.NavigateToResult) -> Way:
         return cls(
             Revision.of(message.room),
@@ -648,7 +673,10 @@ class Motion:
     adapter: Revision | None
 
     @classmethod
+    @understood
     def of(cls, message: odometry_pb2.EstimateMotionResponse) -> Motion:
+        if not message.HasField("motion"):
+            raise ValueError("it has no motion")
         return cls(
             twist_vector(message.motion),
             covariance_matrix(message.covariance),
@@ -668,6 +696,7 @@ class Encoding:
     features: tuple[Feature | None, ...] | None
 
     @classmethod
+    @understood
     def of(cls, message: odometry_pb2.EncodeResponse, with_features: bool) -> Encoding:
         latents = np.array([view.latent.values for view in message.views])
         if not with_features:
@@ -701,6 +730,7 @@ class TrackStart:
     has_visual_odometry: bool
 
     @classmethod
+    @understood
     def of(cls, message: odometry_pb2.TrackStarted) -> TrackStart:
         return cls(
             _revision(message, "adapter"),
@@ -759,6 +789,7 @@ class TrackUpdate:
     elapsed_ns: int
 
     @classmethod
+    @understood
     def of(cls, message: odometry_pb2.TrackUpdate) -> TrackUpdate:
         def pose(field: str) -> Array | None:
             return pose_matrix(getattr(message, field)) if message.HasField(field) else None
@@ -821,6 +852,7 @@ class TrackRefusal:
     frames: int
 
     @classmethod
+    @understood
     def of(cls, message: odometry_pb2.TrackRefusal) -> TrackRefusal:
         reason = _word(odometry_pb2.TrackRefusalReason, message.reason, "TRACK_REFUSAL_REASON_")
         return cls(message.timestamp_ns, message.sequence, reason, message.message, message.frames)
@@ -835,6 +867,7 @@ class Rate:
     high: float
 
     @classmethod
+    @understood
     def of(cls, message: evaluation_pb2.Rate) -> Rate:
         return cls(message.rate, message.low, message.high)
 
@@ -854,6 +887,7 @@ class NavigatorScores:
     recalls: dict[tuple[float, float], Rate]
 
     @classmethod
+    @understood
     def of(cls, message: evaluation_pb2.NavigatorScores) -> NavigatorScores:
         return cls(
             message.name,
@@ -887,6 +921,7 @@ class Evaluation:
     navigators: tuple[NavigatorScores, ...]
 
     @classmethod
+    @understood
     def of(cls, message: evaluation_pb2.EvaluationReport) -> Evaluation:
         return cls(
             Revision.of(message.room),

@@ -8,7 +8,9 @@ made again too. Uploads and other streams are not: a tracking stream resumes by 
 
 from __future__ import annotations
 
+import asyncio
 import json
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,9 @@ MESSAGE_BYTES = 64 << 20
 # switched off says no goodbye, and a stream without a deadline would wait for it for ever.
 SILENCE_MS = 10_000
 PING_ANSWER_MS = 10_000
+
+# What a call raises that was cancelled here; only the asynchronous client's calls do.
+CancelledError = asyncio.CancelledError
 
 # How long an attempt to connect may take, and the longest wait before the next one, milliseconds. gRPC's own are 20 s
 # and 2 minutes, in which a robot is long past a server that came back.
@@ -116,6 +121,38 @@ def metadata(token: str | None) -> list[tuple[str, str]]:
     if not (token.isascii() and token.isprintable()) or " " in token:
         raise ValueError("token: has a character that no token has, such as a space or the end of a line")
     return [("authorization", f"Bearer {token}")]
+
+
+class SyncTimer:
+    """Cancels a call after `deadline_s` seconds, unless it is stopped before; None is never."""
+
+    def __init__(self, call: Any, deadline_s: float | None) -> None:
+        self.is_over = False
+        self._call = call
+        self._timer: Any = None
+        if deadline_s is not None:
+            self._timer = self._started(deadline_s)
+
+    def _started(self, deadline_s: float) -> Any:
+        timer = threading.Timer(deadline_s, self._end)
+        timer.daemon = True
+        timer.start()
+        return timer
+
+    def _end(self) -> None:
+        self.is_over = True
+        self._call.cancel()
+
+    def stop(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+
+
+class AsyncTimer(SyncTimer):
+    """The same on the event loop."""
+
+    def _started(self, deadline_s: float) -> Any:
+        return asyncio.get_running_loop().call_later(deadline_s, self._end)
 
 
 def timeout(deadline_s: float | None) -> float | None:

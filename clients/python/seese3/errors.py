@@ -6,15 +6,27 @@ is what Python programs expect: a `ValueError`, `LookupError`, `TimeoutError`, `
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
+import functools
+from collections.abc import Callable, Iterable
+from typing import Any, ParamSpec, TypeVar
 
 import grpc
+from google.protobuf.message import DecodeError
 from google.rpc import error_details_pb2, status_pb2
+
+# The longest wait that a server may ask for, seconds.
+LONGEST_RETRY_S = 60.0
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 class SeeseError(Exception):
     """Everything that this package raises on purpose."""
+
+
+class AnswerError(SeeseError):
+    """An answer of the server cannot be understood: it is damaged, or the server is newer than this package."""
 
 
 class DamagedError(SeeseError, ValueError):
@@ -108,10 +120,23 @@ CLASSES: dict[grpc.StatusCode, type[RefusedError]] = {
 }
 
 
+def understood(convert: Callable[P, T]) -> Callable[P, T]:
+    """The conversion of an answer, which raises `AnswerError` where the answer is malformed."""
+
+    @functools.wraps(convert)
+    def converted(*args: P.args, **kwargs: P.kwargs) -> T:
+        try:
+            return convert(*args, **kwargs)
+        except (ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:
+            raise AnswerError(f"an answer of the server cannot be understood: {error}") from error
+
+    return converted
+
+
 def refused(error: Any) -> RefusedError:
     """The exception of a `grpc.RpcError`, with what the server said of it."""
     code: grpc.StatusCode = error.code()
-    message: str = error.details() or code.name
+    message: str = printable(error.details() or code.name)
     if code is grpc.StatusCode.UNAVAILABLE and not _metadata(error, "grpc-status-details-bin"):
         message = f"the server cannot be reached: {message}; is it running, and is its address right?"
 
@@ -119,6 +144,11 @@ def refused(error: Any) -> RefusedError:
     return CLASSES.get(code, RefusedError)(
         message, code=code.name, request_id=_text(_metadata(error, "x-request-id")), **details
     )
+
+
+def printable(text: str) -> str:
+    """Text of a server without what could change what a terminal shows."""
+    return "".join(character if character.isprintable() else " " for character in text)
 
 
 def refused_part(code: int, message: str) -> RefusedError:
@@ -148,7 +178,11 @@ def _details(error: Any) -> dict[str, Any]:
         return {}
 
     found: dict[str, Any] = {}
-    for detail in status_pb2.Status.FromString(packed).details:
+    try:
+        details = status_pb2.Status.FromString(packed).details
+    except DecodeError:
+        return {}
+    for detail in details:
         for kind in (
             error_details_pb2.ErrorInfo,
             error_details_pb2.BadRequest,
@@ -156,7 +190,11 @@ def _details(error: Any) -> dict[str, Any]:
             error_details_pb2.RetryInfo,
         ):
             message = kind()
-            if detail.Unpack(message):
+            try:
+                is_known = detail.Unpack(message)
+            except DecodeError:
+                continue
+            if is_known:
                 _note(message, found)
     return found
 
@@ -170,4 +208,5 @@ def _note(detail: Any, found: dict[str, Any]) -> None:
         # The server puts the field that names the missing thing here.
         found.setdefault("field", detail.resource_type)
     elif isinstance(detail, error_details_pb2.RetryInfo):
-        found["retry_after_s"] = detail.retry_delay.seconds + detail.retry_delay.nanos * 1e-9
+        delay_s = detail.retry_delay.seconds + detail.retry_delay.nanos * 1e-9
+        found["retry_after_s"] = min(max(delay_s, 0.0), LONGEST_RETRY_S)

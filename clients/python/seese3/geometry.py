@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,9 @@ def pose_matrix(pose: pb.Pose) -> Array:
     """The (4, 4) matrix of a pose from the wire."""
     p, q = pose.position, pose.orientation
     w, x, y, z = q.w, q.x, q.y, q.z
+    # Not a number is within no bound.
+    if not (abs(w * w + x * x + y * y + z * z - 1) < 1e-3 and abs(p.x) + abs(p.y) + abs(p.z) < math.inf):
+        raise ValueError("a pose has no finite position, or no unit quaternion")
     # Row by row: from a flat tuple NumPy makes a matrix in half the time.
     # fmt: off
     rows = (
@@ -84,6 +88,8 @@ def _quaternion_wxyz(rotation: Array) -> Array:
 def twist_vector(twist: pb.Twist) -> Array:
     """The (6,) vector of a twist from the wire."""
     v, omega = twist.linear, twist.angular
+    if not abs(v.x) + abs(v.y) + abs(v.z) + abs(omega.x) + abs(omega.y) + abs(omega.z) < math.inf:
+        raise ValueError("a twist is not finite")
     return np.array([v.x, v.y, v.z, omega.x, omega.y, omega.z])
 
 

@@ -1,8 +1,11 @@
 //! A client of the service, in wire types. Error messages are one line.
 
+use std::pin::pin;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use tokio_stream::Stream;
+use tokio::time::Instant;
+use tokio_stream::{Stream, StreamExt as _};
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::service::Interceptor;
 use tonic::service::interceptor::InterceptedService;
@@ -13,6 +16,8 @@ use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 use tonic_types::StatusExt;
 
+use crate::checked_status::CheckedStatus;
+use crate::one_line::one_line;
 use crate::proto::v1 as pb;
 use crate::proto::v1::catalog_service_client::CatalogServiceClient;
 use crate::proto::v1::evaluation_service_client::EvaluationServiceClient;
@@ -20,8 +25,79 @@ use crate::proto::v1::localization_service_client::LocalizationServiceClient;
 use crate::proto::v1::navigation_service_client::NavigationServiceClient;
 use crate::proto::v1::odometry_service_client::OdometryServiceClient;
 
+/// Time limit for opening a connection, the TLS handshake included.
+const LONGEST_CONNECTING: Duration = Duration::from_secs(10);
+/// Time without data after which an open call's connection is tested by a ping.
+const SILENCE: Duration = Duration::from_secs(10);
+/// Time limit for the answer to a ping. A connection without one is closed, and its calls fail.
+const PING_ANSWER: Duration = Duration::from_secs(10);
+/// Maximum number of pages of a list. A server's page has up to 1,000 entries.
+const MOST_PAGES: usize = 10_000;
 /// Maximum size of a response, bytes.
 const MESSAGE_BYTES: usize = 64 << 20;
+
+/// The time at which the connection took the last message of an upload.
+#[derive(Debug, Clone)]
+struct LastTaken(Arc<Mutex<Instant>>);
+
+impl LastTaken {
+    fn get(&self) -> Instant {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn set_now(&self) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
+    }
+}
+
+/// The messages of an upload, and the time at which the connection took the last one.
+fn observed<M: Send + 'static>(
+    messages: impl Stream<Item = M> + Send + 'static,
+) -> (impl Stream<Item = M> + Send + 'static, LastTaken) {
+    let last_taken = LastTaken(Arc::new(Mutex::new(Instant::now())));
+    let taken = last_taken.clone();
+    let messages = messages.map(move |message| {
+        taken.set_now();
+        message
+    });
+    (messages, last_taken)
+}
+
+/// The result of a call that ends until `until`. tonic's own deadline ends with the headers of the
+/// response.
+async fn in_time<T>(
+    until: Instant,
+    call: impl Future<Output = Result<T, Status>>,
+) -> Result<T, Error> {
+    let answer = tokio::time::timeout_at(until, call).await;
+    Ok(answer.map_err(|_| Error::Deadline)??)
+}
+
+/// The pages of a list.
+#[derive(Debug, Default)]
+struct Pages {
+    count: usize,
+    token: String,
+}
+
+impl Pages {
+    /// Goes on to the page of `token`. Returns whether there is one.
+    ///
+    /// # Errors
+    /// [`Error::EndlessList`] if the list has no end: a token that comes twice in a row, or more than
+    /// [`MOST_PAGES`].
+    fn go_on(&mut self, token: String) -> Result<bool, Error> {
+        if token.is_empty() {
+            return Ok(false);
+        }
+        self.count += 1;
+        if token == self.token || self.count == MOST_PAGES {
+            return Err(Error::EndlessList);
+        }
+        self.token = token;
+        Ok(true)
+    }
+}
 
 /// Why a call failed.
 #[derive(Debug, thiserror::Error)]
@@ -33,12 +109,14 @@ pub enum Error {
     Connect { address: String, problem: String },
     #[error("the token must consist of visible ASCII characters")]
     Token,
-    #[error("the server refused ({:?}): {}", .0.code(), .0.message())]
+    #[error("{}", described(.0))]
     Refused(Box<Status>),
     #[error("no response before the deadline")]
     Deadline,
     #[error("the server ended the stream without a result")]
     NoReport,
+    #[error("the server's list has no end")]
+    EndlessList,
 }
 
 impl Error {
@@ -73,6 +151,19 @@ impl Error {
     }
 }
 
+/// What the server refused, or why the connection to it broke: only the client's own transport gives a
+/// status a source.
+fn described(status: &Status) -> String {
+    let Some(mut cause) = std::error::Error::source(status) else {
+        let message = one_line(status.message());
+        return format!("the server refused ({:?}): {message}", status.code());
+    };
+    while let Some(next) = cause.source() {
+        cause = next;
+    }
+    format!("the connection to the server broke: {cause}")
+}
+
 impl From<Status> for Error {
     fn from(status: Status) -> Self {
         // The client's own transport reports an expired deadline as a cancellation with this text.
@@ -87,15 +178,15 @@ impl From<Status> for Error {
 /// A connection to a server. Clones are cheap and share the connection.
 #[derive(Debug, Clone)]
 pub struct Client {
-    channel: InterceptedService<Channel, Token>,
+    channel: InterceptedService<CheckedStatus<Channel>, Token>,
     deadline: Duration,
 }
 
 /// Options of a connection.
 #[derive(Debug, Clone)]
 pub struct ConnectOptions {
-    /// Deadline of every call, except `create_room`, `publish_adapter` and `refit_room`, which have
-    /// none. For `track`, it limits only the opening of the stream.
+    /// Deadline of every call. For `track`, it limits only the opening of the stream. For
+    /// `create_room`, `publish_adapter` and `refit_room`, it limits the time without progress.
     pub deadline: Duration,
     /// Bearer token of every call, if the server requires one.
     pub token: Option<String>,
@@ -163,6 +254,12 @@ impl Client {
             }
         };
 
+        if tls.is_some() && address.starts_with("http://") {
+            return Err(Error::Address {
+                address: address.to_owned(),
+                problem: "http:// is without TLS, but certificates are given".to_owned(),
+            });
+        }
         let url = match &tls {
             _ if address.contains("://") => address.to_owned(),
             Some(_) => format!("https://{address}"),
@@ -173,9 +270,12 @@ impl Client {
             problem: error.to_string(),
         })?;
 
+        let within = deadline.min(LONGEST_CONNECTING);
         let mut endpoint = endpoint
-            .connect_timeout(deadline.min(Duration::from_secs(10)))
-            .tcp_nodelay(true);
+            .connect_timeout(within)
+            .tcp_nodelay(true)
+            .http2_keep_alive_interval(SILENCE)
+            .keep_alive_timeout(PING_ANSWER);
         if let Some(tls) = tls {
             let mut config =
                 ClientTlsConfig::new().ca_certificate(Certificate::from_pem(tls.authorities));
@@ -191,18 +291,21 @@ impl Client {
                 })?;
         }
 
+        let failed = |problem| Error::Connect {
+            address: address.to_owned(),
+            problem,
+        };
+        // tonic's time limit does not include the TLS handshake.
+        let connected = tokio::time::timeout(within, endpoint.connect()).await;
+        let connected = connected.map_err(|_| failed("no answer in time".to_owned()))?;
         // tonic's error is only "transport error"; its source has the cause.
-        let channel = endpoint.connect().await.map_err(|error| {
-            let cause =
-                std::error::Error::source(&error).map_or(error.to_string(), ToString::to_string);
-            Error::Connect {
-                address: address.to_owned(),
-                problem: cause,
-            }
+        let channel = connected.map_err(|error| {
+            let cause = std::error::Error::source(&error);
+            failed(cause.map_or(error.to_string(), ToString::to_string))
         })?;
 
         Ok(Self {
-            channel: InterceptedService::new(channel, Token(token)),
+            channel: InterceptedService::new(CheckedStatus(channel), Token(token)),
             deadline,
         })
     }
@@ -218,7 +321,10 @@ impl Client {
     ) -> Result<pb::NavigateResponse, Error> {
         let mut service = NavigationServiceClient::new(self.channel.clone())
             .max_decoding_message_size(MESSAGE_BYTES);
-        Ok(service.navigate(self.request(request)).await?.into_inner())
+        Ok(self
+            .in_time(service.navigate(self.request(request)))
+            .await?
+            .into_inner())
     }
 
     /// Several navigation requests in one call. Results are in the order of the requests.
@@ -232,8 +338,8 @@ impl Client {
     ) -> Result<Vec<pb::BatchNavigateResult>, Error> {
         let mut service = NavigationServiceClient::new(self.channel.clone())
             .max_decoding_message_size(MESSAGE_BYTES);
-        Ok(service
-            .batch_navigate(self.request(pb::BatchNavigateRequest { requests }))
+        Ok(self
+            .in_time(service.batch_navigate(self.request(pb::BatchNavigateRequest { requests })))
             .await?
             .into_inner()
             .results)
@@ -249,12 +355,11 @@ impl Client {
         mut feedback: impl FnMut(pb::NavigateToFeedback),
     ) -> Result<pb::NavigateToResult, Error> {
         let mut service = NavigationServiceClient::new(self.channel.clone());
-        let mut events = service
-            .navigate_to(self.request(request))
-            .await?
-            .into_inner();
+        let until = Instant::now() + self.deadline;
+        let opened = in_time(until, service.navigate_to(self.request(request))).await?;
+        let mut events = opened.into_inner();
 
-        while let Some(pb::NavigateToResponse { event }) = events.message().await? {
+        while let Some(pb::NavigateToResponse { event }) = in_time(until, events.message()).await? {
             match event {
                 Some(pb::navigate_to_response::Event::Result(result)) => return Ok(result),
                 Some(pb::navigate_to_response::Event::Feedback(step)) => feedback(step),
@@ -275,7 +380,10 @@ impl Client {
     ) -> Result<pb::LocalizeResponse, Error> {
         let mut service = LocalizationServiceClient::new(self.channel.clone())
             .max_decoding_message_size(MESSAGE_BYTES);
-        Ok(service.localize(self.request(request)).await?.into_inner())
+        Ok(self
+            .in_time(service.localize(self.request(request)))
+            .await?
+            .into_inner())
     }
 
     /// The rooms ranked by their match with the given views, and the pose in each.
@@ -288,8 +396,8 @@ impl Client {
     ) -> Result<pb::RelocalizeResponse, Error> {
         let mut service = LocalizationServiceClient::new(self.channel.clone())
             .max_decoding_message_size(MESSAGE_BYTES);
-        Ok(service
-            .relocalize(self.request(request))
+        Ok(self
+            .in_time(service.relocalize(self.request(request)))
             .await?
             .into_inner())
     }
@@ -303,8 +411,8 @@ impl Client {
         request: pb::EstimateMotionRequest,
     ) -> Result<pb::EstimateMotionResponse, Error> {
         let mut service = OdometryServiceClient::new(self.channel.clone());
-        Ok(service
-            .estimate_motion(self.request(request))
+        Ok(self
+            .in_time(service.estimate_motion(self.request(request)))
             .await?
             .into_inner())
     }
@@ -316,7 +424,10 @@ impl Client {
     pub async fn encode(&self, request: pb::EncodeRequest) -> Result<pb::EncodeResponse, Error> {
         let mut service = OdometryServiceClient::new(self.channel.clone())
             .max_decoding_message_size(MESSAGE_BYTES);
-        Ok(service.encode(self.request(request)).await?.into_inner())
+        Ok(self
+            .in_time(service.encode(self.request(request)))
+            .await?
+            .into_inner())
     }
 
     /// Opens a tracking stream: sends `requests` as they are produced and returns the stream of
@@ -333,8 +444,7 @@ impl Client {
     ) -> Result<Streaming<pb::TrackResponse>, Error> {
         let mut service = OdometryServiceClient::new(self.channel.clone())
             .max_decoding_message_size(MESSAGE_BYTES);
-        let opened = tokio::time::timeout(self.deadline, service.track(requests)).await;
-        Ok(opened.map_err(|_| Error::Deadline)??.into_inner())
+        Ok(self.in_time(service.track(requests)).await?.into_inner())
     }
 
     /// All frames of a room, read page by page. `neighbours_within` adds to each frame its
@@ -342,7 +452,7 @@ impl Client {
     /// of this width, pixels, if the server provides images.
     ///
     /// # Errors
-    /// [`Error::Refused`], also if the room changes between two pages.
+    /// [`Error::Refused`], also if the room changes between two pages; [`Error::EndlessList`].
     pub async fn frames(
         &self,
         room: &str,
@@ -352,20 +462,22 @@ impl Client {
         let mut service = CatalogServiceClient::new(self.channel.clone())
             .max_decoding_message_size(MESSAGE_BYTES);
         let mut frames = Vec::new();
-        let mut page_token = String::new();
+        let mut pages = Pages::default();
         loop {
             let request = self.request(pb::ListFramesRequest {
                 room: room.to_owned(),
                 page_size: 0,
-                page_token,
+                page_token: pages.token.clone(),
                 neighbours_within,
                 thumbnail_width,
             });
-            let page = service.list_frames(request).await?.into_inner();
+            let page = self
+                .in_time(service.list_frames(request))
+                .await?
+                .into_inner();
             frames.extend(page.frames);
 
-            page_token = page.next_page_token;
-            if page_token.is_empty() {
+            if !pages.go_on(page.next_page_token)? {
                 return Ok(frames);
             }
         }
@@ -374,21 +486,23 @@ impl Client {
     /// All rooms, read page by page.
     ///
     /// # Errors
-    /// [`Error::Refused`].
+    /// [`Error::Refused`], [`Error::EndlessList`].
     pub async fn rooms(&self) -> Result<Vec<pb::Room>, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
         let mut rooms = Vec::new();
-        let mut page_token = String::new();
+        let mut pages = Pages::default();
         loop {
             let request = self.request(pb::ListRoomsRequest {
                 page_size: 0,
-                page_token,
+                page_token: pages.token.clone(),
             });
-            let page = service.list_rooms(request).await?.into_inner();
+            let page = self
+                .in_time(service.list_rooms(request))
+                .await?
+                .into_inner();
             rooms.extend(page.rooms);
 
-            page_token = page.next_page_token;
-            if page_token.is_empty() {
+            if !pages.go_on(page.next_page_token)? {
                 return Ok(rooms);
             }
         }
@@ -400,10 +514,10 @@ impl Client {
     /// [`Error::Refused`].
     pub async fn room(&self, room: &str) -> Result<Option<pb::Room>, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
-        Ok(service
-            .get_room(self.request(pb::GetRoomRequest {
+        Ok(self
+            .in_time(service.get_room(self.request(pb::GetRoomRequest {
                 room: room.to_owned(),
-            }))
+            })))
             .await?
             .into_inner()
             .room)
@@ -412,21 +526,23 @@ impl Client {
     /// All adapters, read page by page.
     ///
     /// # Errors
-    /// [`Error::Refused`].
+    /// [`Error::Refused`], [`Error::EndlessList`].
     pub async fn adapters(&self) -> Result<Vec<pb::Adapter>, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
         let mut adapters = Vec::new();
-        let mut page_token = String::new();
+        let mut pages = Pages::default();
         loop {
             let request = self.request(pb::ListAdaptersRequest {
                 page_size: 0,
-                page_token,
+                page_token: pages.token.clone(),
             });
-            let page = service.list_adapters(request).await?.into_inner();
+            let page = self
+                .in_time(service.list_adapters(request))
+                .await?
+                .into_inner();
             adapters.extend(page.adapters);
 
-            page_token = page.next_page_token;
-            if page_token.is_empty() {
+            if !pages.go_on(page.next_page_token)? {
                 return Ok(adapters);
             }
         }
@@ -442,48 +558,59 @@ impl Client {
             adapter: adapter.to_owned(),
         });
 
-        Ok(service.get_adapter(request).await?.into_inner().adapter)
+        Ok(self
+            .in_time(service.get_adapter(request))
+            .await?
+            .into_inner()
+            .adapter)
     }
 
     /// Publishes a room from a `RoomUpload`, batches of frames and an `UploadEnd`, in this order.
-    /// The client sets no deadline.
     ///
     /// # Errors
-    /// [`Error::Refused`].
+    /// [`Error::Refused`]; [`Error::Deadline`] if the connection takes no message for as long as the
+    /// deadline, or there is no response within it after the last one. The room may then still be
+    /// published.
     pub async fn create_room(
         &self,
         messages: impl Stream<Item = pb::CreateRoomRequest> + Send + 'static,
     ) -> Result<pb::CreateRoomResponse, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
-        Ok(service.create_room(messages).await?.into_inner())
+        let (messages, last_taken) = observed(messages);
+        self.uploaded(service.create_room(messages), last_taken)
+            .await
     }
 
     /// Publishes an externally trained adapter from an `AdapterUpload` and its weights, in this
-    /// order. The client sets no deadline.
+    /// order.
     ///
     /// # Errors
-    /// [`Error::Refused`].
+    /// As [`Client::create_room`].
     pub async fn publish_adapter(
         &self,
         messages: impl Stream<Item = pb::PublishAdapterRequest> + Send + 'static,
     ) -> Result<pb::PublishAdapterResponse, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
-        Ok(service.publish_adapter(messages).await?.into_inner())
+        let (messages, last_taken) = observed(messages);
+        self.uploaded(service.publish_adapter(messages), last_taken)
+            .await
     }
 
-    /// Fits an adapter to a room on the server. `progress` is called for each progress message. The
-    /// client sets no deadline: a fit takes minutes.
+    /// Fits an adapter to a room on the server. `progress` is called for each progress message; the
+    /// server sends one every second, also while the fit waits for its turn.
     ///
     /// # Errors
-    /// [`Error::Refused`], or [`Error::NoReport`] if the stream ends without a result.
+    /// [`Error::Refused`], [`Error::Deadline`] if no message comes for as long as the deadline, or
+    /// [`Error::NoReport`] if the stream ends without a result.
     pub async fn refit_room(
         &self,
         request: pb::RefitRoomRequest,
         mut progress: impl FnMut(pb::RefitProgress),
     ) -> Result<pb::RefitResult, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
-        let mut events = service.refit_room(request).await?.into_inner();
-        while let Some(pb::RefitRoomResponse { event }) = events.message().await? {
+        let opened = self.in_time(service.refit_room(request)).await?;
+        let mut events = opened.into_inner();
+        while let Some(pb::RefitRoomResponse { event }) = self.in_time(events.message()).await? {
             match event {
                 Some(pb::refit_room_response::Event::Result(result)) => return Ok(result),
                 Some(pb::refit_room_response::Event::Progress(step)) => progress(step),
@@ -504,7 +631,9 @@ impl Client {
         request: pb::SetDefaultRequest,
     ) -> Result<Vec<pb::Default>, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
-        let answer = service.set_default(self.request(request)).await?;
+        let answer = self
+            .in_time(service.set_default(self.request(request)))
+            .await?;
         Ok(answer.into_inner().defaults)
     }
 
@@ -517,7 +646,9 @@ impl Client {
         request: pb::RollBackDefaultRequest,
     ) -> Result<Vec<pb::Default>, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
-        let answer = service.roll_back_default(self.request(request)).await?;
+        let answer = self
+            .in_time(service.roll_back_default(self.request(request)))
+            .await?;
         Ok(answer.into_inner().defaults)
     }
 
@@ -527,7 +658,9 @@ impl Client {
     /// [`Error::Refused`].
     pub async fn delete_room(&self, request: pb::DeleteRoomRequest) -> Result<Vec<u64>, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
-        let answer = service.delete_room(self.request(request)).await?;
+        let answer = self
+            .in_time(service.delete_room(self.request(request)))
+            .await?;
         Ok(answer.into_inner().revisions)
     }
 
@@ -540,7 +673,9 @@ impl Client {
         request: pb::DeleteAdapterRequest,
     ) -> Result<Vec<u64>, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
-        let answer = service.delete_adapter(self.request(request)).await?;
+        let answer = self
+            .in_time(service.delete_adapter(self.request(request)))
+            .await?;
         Ok(answer.into_inner().revisions)
     }
 
@@ -556,8 +691,10 @@ impl Client {
     ) -> Result<pb::EvaluationReport, Error> {
         let mut service = EvaluationServiceClient::new(self.channel.clone())
             .max_decoding_message_size(MESSAGE_BYTES);
-        let mut events = service.evaluate(self.request(request)).await?.into_inner();
-        while let Some(pb::EvaluateResponse { event }) = events.message().await? {
+        let until = Instant::now() + self.deadline;
+        let opened = in_time(until, service.evaluate(self.request(request))).await?;
+        let mut events = opened.into_inner();
+        while let Some(pb::EvaluateResponse { event }) = in_time(until, events.message()).await? {
             match event {
                 Some(pb::evaluate_response::Event::Report(report)) => return Ok(report),
                 Some(pb::evaluate_response::Event::Progress(step)) => progress(step),
@@ -577,8 +714,8 @@ impl Client {
         request: pb::ScorePredictionsRequest,
     ) -> Result<pb::ScorePredictionsResponse, Error> {
         let mut service = EvaluationServiceClient::new(self.channel.clone());
-        Ok(service
-            .score_predictions(self.request(request))
+        Ok(self
+            .in_time(service.score_predictions(self.request(request)))
             .await?
             .into_inner())
     }
@@ -594,12 +731,154 @@ impl Client {
             service: name.to_owned(),
         });
 
-        Ok(health.check(request).await?.into_inner().status() == ServingStatus::Serving)
+        Ok(self
+            .in_time(health.check(request))
+            .await?
+            .into_inner()
+            .status()
+            == ServingStatus::Serving)
+    }
+
+    /// The response to an upload, within the deadline after each message that the connection takes.
+    async fn uploaded<A>(
+        &self,
+        call: impl Future<Output = Result<tonic::Response<A>, Status>>,
+        last_taken: LastTaken,
+    ) -> Result<A, Error> {
+        let mut answer = pin!(call);
+        loop {
+            let last = last_taken.get();
+            match tokio::time::timeout_at(last + self.deadline, &mut answer).await {
+                Ok(answer) => return Ok(answer?.into_inner()),
+                Err(_) if last_taken.get() > last => {}
+                Err(_) => return Err(Error::Deadline),
+            }
+        }
+    }
+
+    /// The result of a call within the deadline.
+    async fn in_time<T>(&self, call: impl Future<Output = Result<T, Status>>) -> Result<T, Error> {
+        in_time(Instant::now() + self.deadline, call).await
     }
 
     fn request<T>(&self, message: T) -> tonic::Request<T> {
         let mut request = tonic::Request::new(message);
         request.set_timeout(self.deadline);
         request
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a failed step is a failed test")]
+mod tests {
+    use super::*;
+
+    /// Oracle: the contract: no call waits longer than its deadline for a server that says nothing, an
+    /// upload of many messages included.
+    #[tokio::test]
+    async fn a_silent_server_is_given_up() {
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap().to_string();
+        let deadline = Duration::from_millis(200);
+        let client = Client::connect(&address, deadline).await.unwrap();
+
+        let frames = pb::FrameBatch {
+            poses: vec![0; 1 << 20],
+            ..pb::FrameBatch::default()
+        };
+        let message = Some(pb::create_room_request::Message::Frames(frames));
+        let messages = vec![pb::CreateRoomRequest { message }; 100];
+        let upload = client.create_room(tokio_stream::iter(messages)).await;
+        assert!(matches!(upload, Err(Error::Deadline)), "{upload:?}");
+        let upload = client.publish_adapter(tokio_stream::iter([])).await;
+        assert!(matches!(upload, Err(Error::Deadline)), "{upload:?}");
+        let fit = client
+            .refit_room(pb::RefitRoomRequest::default(), |_| ())
+            .await;
+        assert!(matches!(fit, Err(Error::Deadline)), "{fit:?}");
+        let stream = client.track(tokio_stream::iter([])).await;
+        assert!(
+            matches!(stream, Err(Error::Deadline)),
+            "{:?}",
+            stream.map(drop)
+        );
+        let call = client.navigate(pb::NavigateRequest::default()).await;
+        assert!(matches!(call, Err(Error::Deadline)), "{call:?}");
+    }
+
+    /// Oracle: the contract: a list ends at its last page, and one whose token comes again has no end.
+    #[test]
+    fn a_list_without_an_end_is_refused() {
+        let mut pages = Pages::default();
+        assert!(matches!(pages.go_on("1".to_owned()), Ok(true)));
+        assert!(matches!(pages.go_on("2".to_owned()), Ok(true)));
+        assert!(matches!(pages.go_on(String::new()), Ok(false)));
+        assert!(matches!(
+            pages.go_on("2".to_owned()),
+            Err(Error::EndlessList)
+        ));
+
+        let mut pages = Pages::default();
+        let ends = (0..MOST_PAGES).map(|page| pages.go_on(page.to_string()).is_err());
+        assert_eq!(ends.filter(|ends| *ends).count(), 1);
+    }
+
+    /// Oracle: the contract: TLS is not turned off by an address, and no connection is opened then.
+    #[tokio::test]
+    async fn an_address_does_not_turn_tls_off() {
+        let options = ConnectOptions {
+            deadline: Duration::from_secs(1),
+            token: Some("secret".to_owned()),
+            tls: Some(ClientTls {
+                authorities: Vec::new(),
+                identity: None,
+            }),
+        };
+        let refused = Client::connect_with("http://127.0.0.1:9", options).await;
+        assert!(matches!(refused, Err(Error::Address { .. })), "{refused:?}");
+    }
+
+    /// Oracle: the contract: a server's refusal is quoted in one line; a broken connection is no refusal.
+    #[test]
+    fn a_broken_connection_is_no_refusal() {
+        let refused = Error::from(Status::not_found("no\nroom"));
+        assert_eq!(
+            refused.to_string(),
+            "the server refused (NotFound): no room"
+        );
+
+        let cause = std::io::Error::other("the peer is gone");
+        let broken = Error::from(Status::from_error(Box::new(cause)));
+        assert_eq!(
+            broken.to_string(),
+            "the connection to the server broke: the peer is gone"
+        );
+    }
+
+    /// Oracle: the contract: an upload that goes on may take longer than the deadline.
+    #[tokio::test(start_paused = true)]
+    async fn an_upload_that_goes_on_is_not_given_up() {
+        let deadline = Duration::from_secs(1);
+        let client = Client {
+            channel: InterceptedService::new(
+                CheckedStatus(Endpoint::from_static("http://127.0.0.1:9").connect_lazy()),
+                Token(None),
+            ),
+            deadline,
+        };
+        let (messages, last_taken) = observed(tokio_stream::iter(0..10));
+        let mut messages = pin!(messages);
+        let call = async {
+            while messages.next().await.is_some() {
+                tokio::time::sleep(deadline * 9 / 10).await;
+            }
+            Ok(tonic::Response::new(7))
+        };
+        assert!(matches!(client.uploaded(call, last_taken).await, Ok(7)));
+
+        let (_messages, last_taken) = observed(tokio_stream::iter([0]));
+        let call = std::future::pending::<Result<tonic::Response<()>, Status>>();
+        let given_up = client.uploaded(call, last_taken).await;
+        assert!(matches!(given_up, Err(Error::Deadline)));
     }
 }

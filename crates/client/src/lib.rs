@@ -43,6 +43,8 @@
 //! The feature `server` adds the server side of the protocol; clients do not need it.
 
 pub mod proto;
+mod checked_status;
+mod one_line;
 pub mod convert;
 mod client;
 mod newest;
@@ -51,5 +53,6 @@ pub use client::{Client, ClientTls, ConnectOptions, Error};
 /// The types used by [`convert`].
 pub use nalgebra;
 pub use newest::Newest;
+pub use one_line::one_line;
 /// The types of streams and statuses.
 pub use tonic;

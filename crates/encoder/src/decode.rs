@@ -48,7 +48,7 @@ const HEADER_BYTES: u64 = 1 << 20;
 impl Bounds {
     /// Limits for the user's own files.
     pub const LOCAL: Self = Self {
-        bytes: 256 << 20,
+        bytes: seese3_files::IMAGE_FILE_BYTES,
         pixels: 100_000_000,
     };
 }
@@ -289,9 +289,23 @@ fn after_header(bytes: &[u8]) -> Option<&[u8]> {
 /// Reads and decodes a room's image: a file below `root`, or the part `FILE@OFFSET+LENGTH` of one.
 ///
 /// # Errors
-/// [`Error::Io`] if the file cannot be read, [`Error::BadImage`] if the part lies outside the file
-/// or the image cannot be decoded within [`Bounds::LOCAL`].
+/// As [`read_image_bytes`]; [`Error::BadImage`] if the image cannot be decoded within
+/// [`Bounds::LOCAL`].
 pub fn read_image(root: &Path, image: &str) -> Result<RgbImage, Error> {
+    let bytes = read_image_bytes(root, image)?;
+    decode(
+        &root.join(image).display().to_string(),
+        &bytes,
+        Bounds::LOCAL,
+    )
+}
+
+/// Reads a room's image without decoding it. `root` and `image` are as in [`read_image`].
+///
+/// # Errors
+/// [`Error::Io`] if the file cannot be read, [`Error::BadImage`] if the part lies outside the file
+/// or the image has more bytes than [`Bounds::LOCAL`].
+pub fn read_image_bytes(root: &Path, image: &str) -> Result<Vec<u8>, Error> {
     let ImagePart { path, file, length } = open_part(root, image)?;
 
     // `decode` checks this too, but only after the bytes were read into memory.
@@ -314,7 +328,7 @@ pub fn read_image(root: &Path, image: &str) -> Result<RgbImage, Error> {
             cause,
         })?;
 
-    decode(&path.display().to_string(), &bytes, Bounds::LOCAL)
+    Ok(bytes)
 }
 
 /// The width and height of a room's image, upright, in pixels, from its header alone.

@@ -43,7 +43,7 @@ mod backbone;
 pub use builtin::{BUILTIN_DIM, builtin_source, encode_builtin};
 pub use decode::{
     Bounds, DecodingCost, GrayImage16, decode, decode_gray16, decoding_cost, encode_png,
-    image_size, read_image,
+    image_size, read_image, read_image_bytes,
 };
 pub use journal::{EncodedFrame, Journal, NumberedFrames};
 pub use keypoints::KeypointOutputs;
@@ -270,6 +270,7 @@ impl Encoder {
         // The trial run gives the rank and width of each output. If no size is fixed, it uses a
         // small image.
         let (width, height) = size.unwrap_or((64, 64));
+        check_input_size(&file, width, height)?;
         let grey = RgbImage {
             width,
             height,
@@ -742,4 +743,18 @@ pub fn parse_crop(text: &str) -> Result<Option<(usize, usize)>, Error> {
 /// [`Error::Option`] if the text is of another form.
 pub fn parse_channels(what: &'static str, text: &str) -> Result<[f32; 3], Error> {
     preparation::three(what, text)
+}
+
+/// Checks that a model's input is not larger than images may be.
+fn check_input_size(file: &Path, width: usize, height: usize) -> Result<(), Error> {
+    let most = Bounds::LOCAL.pixels;
+    let pixels = width.checked_mul(height).map(|pixels| pixels as u64);
+    if pixels.is_some_and(|pixels| pixels <= most) {
+        return Ok(());
+    }
+    let problem = format!("takes images of {width}×{height} pixels; the limit is {most} in all");
+    Err(Error::Model {
+        file: file.to_owned(),
+        problem: problem.into(),
+    })
 }

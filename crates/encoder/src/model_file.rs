@@ -43,6 +43,13 @@ struct NodeProto {
 struct AttributeProto {
     #[prost(message, optional, tag = "5")]
     tensor: Option<TensorProto>,
+    /// The branches and bodies of If, Loop and Scan.
+    #[prost(message, optional, boxed, tag = "6")]
+    graph: Option<Box<GraphProto>>,
+    #[prost(message, repeated, tag = "10")]
+    tensors: Vec<TensorProto>,
+    #[prost(message, repeated, tag = "11")]
+    graphs: Vec<GraphProto>,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -250,21 +257,31 @@ fn read_graph(file: &Path) -> Result<(Vec<u8>, GraphProto), Error> {
     Ok((bytes, graph))
 }
 
-/// The names of the external files with the graph's weights.
-fn weight_files(graph: &GraphProto) -> BTreeSet<&str> {
-    let constants = graph.node.iter().flat_map(|node| &node.attribute);
-    let constants = constants.filter_map(|attribute| attribute.tensor.as_ref());
-    let outside = graph
-        .initializer
-        .iter()
-        .chain(constants)
-        .filter(|tensor| tensor.location != 0);
+/// Adds the names of the external files with the weights of a graph and its subgraphs.
+fn add_weight_files<'a>(graph: &'a GraphProto, names: &mut BTreeSet<&'a str>) {
+    add_external(&graph.initializer, names);
+    for attribute in graph.node.iter().flat_map(|node| &node.attribute) {
+        add_external(&attribute.tensor, names);
+        add_external(&attribute.tensors, names);
+        for graph in attribute
+            .graph
+            .iter()
+            .map(AsRef::as_ref)
+            .chain(&attribute.graphs)
+        {
+            add_weight_files(graph, names);
+        }
+    }
+}
 
-    let names = outside.flat_map(|tensor| &tensor.external);
-    names
-        .filter(|entry| entry.key == "location")
-        .map(|entry| entry.value.as_str())
-        .collect()
+fn add_external<'a>(
+    tensors: impl IntoIterator<Item = &'a TensorProto>,
+    names: &mut BTreeSet<&'a str>,
+) {
+    let outside = tensors.into_iter().filter(|tensor| tensor.location != 0);
+    let entries = outside.flat_map(|tensor| &tensor.external);
+    let locations = entries.filter(|entry| entry.key == "location");
+    names.extend(locations.map(|entry| entry.value.as_str()));
 }
 
 /// The file's name and a digest of the model and its weights.
@@ -276,7 +293,9 @@ fn id_of(file: &Path, bytes: &[u8], graph: &GraphProto) -> Result<String, Error>
 
     let mut digest = Sha256::new();
     digest.update(bytes);
-    for name in weight_files(graph) {
+    let mut names = BTreeSet::new();
+    add_weight_files(graph, &mut names);
+    for name in names {
         let wrong = |problem: Cause| Error::Model {
             file: file.to_owned(),
             problem,

@@ -2,7 +2,7 @@
 
 use seese3_core::Cause;
 use std::path::Path;
-use std::sync::{Mutex, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use ndarray::{ArrayD, Axis, Slice};
 use ort::environment::Environment;
@@ -156,6 +156,9 @@ fn environment(library: Option<&Path>) -> Result<&'static Environment, Error> {
         builder
             .with_name("seese3")
             .with_telemetry(false)
+            // onnxruntime would write to standard error, past the program's log, and wait for it. What
+            // fails is returned as an error too.
+            .with_logger(Arc::new(|_, _, _, _, _| ()))
             .build()
             .map_err(|error| error.to_string())
     };

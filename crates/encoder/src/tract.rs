@@ -3,8 +3,10 @@
 //! the threads of the calling rayon pool.
 
 use seese3_core::Cause;
+use std::cell::Cell;
+use std::panic::UnwindSafe;
 use std::path::Path;
-use std::sync::Arc;
+use std::sync::{Arc, Once};
 
 use ndarray::{ArrayD, ArrayViewD, Axis};
 use rayon::prelude::*;
@@ -60,7 +62,7 @@ impl Tract {
 
         // tract panics on some damaged models. The panic can be caught, because no shared state
         // remains.
-        let model = std::panic::catch_unwind(plan).map_err(|_| {
+        let model = without_panic(plan).ok_or_else(|| {
             wrong("cannot be run by tract, which panicked while planning the model".into())
         })?;
         let model = model.map_err(|error| {
@@ -103,6 +105,29 @@ impl Tract {
     }
 }
 
+thread_local! {
+    /// Whether panics of this thread are caught and not to be printed.
+    static CATCHES: Cell<bool> = const { Cell::new(false) };
+}
+
+/// The result of `work`; `None` if it panicked. The panic is not printed.
+fn without_panic<T>(work: impl FnOnce() -> T + UnwindSafe) -> Option<T> {
+    static HOOK: Once = Once::new();
+    HOOK.call_once(|| {
+        let printed = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |panic| {
+            if !CATCHES.get() {
+                printed(panic);
+            }
+        }));
+    });
+
+    CATCHES.set(true);
+    let result = std::panic::catch_unwind(work).ok();
+    CATCHES.set(false);
+    result
+}
+
 impl Runner for Tract {
     fn run(&self, input: ArrayD<f32>) -> Result<Vec<ArrayD<f32>>, Error> {
         let clips: Vec<_> = (0..input.shape()[0]).collect();
@@ -126,5 +151,27 @@ impl Runner for Tract {
         };
 
         (0..count).map(joined).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use super::*;
+
+    /// Oracle: the contract: a panic is caught and not printed, and other panics are printed as before.
+    #[test]
+    fn panics_are_caught_in_silence() {
+        static PRINTED: AtomicUsize = AtomicUsize::new(0);
+        std::panic::set_hook(Box::new(|_| {
+            PRINTED.fetch_add(1, Ordering::Relaxed);
+        }));
+
+        assert_eq!(without_panic(|| 7), Some(7));
+        assert_eq!(without_panic(|| -> u8 { panic!("caught") }), None);
+        assert_eq!(PRINTED.load(Ordering::Relaxed), 0);
+        assert!(std::panic::catch_unwind(|| panic!("printed")).is_err());
+        assert_eq!(PRINTED.load(Ordering::Relaxed), 1);
     }
 }

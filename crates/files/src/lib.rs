@@ -5,6 +5,11 @@ use std::fs::{File, OpenOptions};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
+/// Maximum size of configuration files, credentials and tokens, bytes.
+pub const SMALL_FILE_BYTES: u64 = 16 << 20;
+/// Maximum size of an encoded image, bytes.
+pub const IMAGE_FILE_BYTES: u64 = 256 << 20;
+
 /// Opens a regular file for reading, or a link to one. Does not block on other files.
 ///
 /// # Errors
@@ -76,7 +81,7 @@ pub fn below(root: &Path, file: &Path) -> io::Result<PathBuf> {
     }
     Err(io::Error::new(
         io::ErrorKind::InvalidInput,
-        "is a link to a file outside the folder",
+        "is a link to a file outside the folder; copy the file into it",
     ))
 }
 

@@ -8,6 +8,7 @@ use tonic::Request;
 
 use super::auth::{Principal, RoomScope};
 use super::connections::Peer;
+use super::quota::Quota;
 
 /// A caller: the authenticated principal, or the connection on a server without credentials.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -70,6 +71,12 @@ impl Requester {
     pub fn scope(&self) -> Option<&RoomScope> {
         let principal = self.principal.as_ref();
         principal.map(|principal| principal.rooms())
+    }
+
+    /// What it may store.
+    pub fn quota(&self) -> Quota {
+        let principal = self.principal.as_ref();
+        principal.map_or_else(Quota::default, |principal| principal.quota())
     }
 
     /// Its name; empty on a server without credentials.

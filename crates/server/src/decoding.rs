@@ -6,7 +6,7 @@
 use std::sync::{Condvar, Mutex, PoisonError};
 
 /// A budget for the images that are decoded at one time, bytes.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct DecodingMemory {
     budget: u64,
     free: Mutex<u64>,

@@ -45,9 +45,12 @@ pub enum RoomHealth {
     Hidden,
 }
 
+/// Maximum size of a health request, bytes: the name of a service or room.
+pub const HEALTH_BYTES: usize = 1 << 10;
+
 /// The health service for the phase in this channel.
 pub fn service(phase: watch::Receiver<Phase>, rooms: RoomHealth) -> HealthServer<HealthOf> {
-    HealthServer::new(HealthOf(phase, rooms))
+    HealthServer::new(HealthOf(phase, rooms)).max_decoding_message_size(HEALTH_BYTES)
 }
 
 /// The status of the service or room `name`; `None` if the name is unknown. Rooms are unknown until

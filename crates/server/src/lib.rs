@@ -34,6 +34,7 @@ mod decoding;
 mod image_encoder;
 mod request_metrics;
 mod operations;
+mod quota;
 mod auth;
 mod caller;
 mod shares;
@@ -61,6 +62,7 @@ pub use auth::{AuthError, Keyring};
 pub use convert::{camera_to_wire, source_to_wire};
 pub use image_encoder::ImageEncoders;
 pub use metrics::Metrics;
+pub use quota::Quota;
 pub use reload::Reload;
 pub use shutdown::shutdown_signal;
 pub use snapshot::{RoomMemory, Snapshot};
@@ -78,15 +80,16 @@ use std::time::Duration;
 
 use prost::Message;
 use tokio::net::TcpListener;
-use tokio::sync::{Semaphore, oneshot, watch};
+use tokio::sync::{oneshot, watch};
 use tonic::transport::Server;
 use tonic::{Request, Response, Status};
 use tower::util::MapRequestLayer;
 use tower_http::request_id::{PropagateRequestIdLayer, SetRequestIdLayer};
 use tower_http::trace::TraceLayer;
 
-use auth::{AuthLayer, Principal};
+use auth::{AuthLayer, Principal, RoomScope};
 use catalog::Changes;
+use connections::Acceptance;
 use cost::Costs;
 use health::RoomHealth;
 use memory::{Memory, MemoryLayer, respond, with_lease};
@@ -101,9 +104,14 @@ use seese3_client::proto::v1::odometry_service_server::OdometryServiceServer;
 use seese3_core::cancel::Cancellation;
 use seese3_core::navigation::{IndexKind, Limits};
 use seese3_store::Store;
+use shares::Shares;
 use snapshot::Loader;
 use workers::{Lane, Workers};
 
+/// Maximum number of blocking threads that a server may need, of tokio's runtime
+/// (`max_blocking_threads`): those of jobs that run, are paused or wait for the disk, and of reads of
+/// the store.
+pub const MAX_BLOCKING_THREADS: usize = 2_048;
 /// Divisor for the memory budget of images that are decoded: 1/4 of the request budget.
 const DECODING: usize = 4;
 /// Divisor for the memory budget of health watchers: 1/8 of the request budget.
@@ -137,6 +145,8 @@ pub struct Config {
     pub writable: bool,
     /// Whether callers may get the rooms' images as thumbnails.
     pub thumbnails: bool,
+    /// The most that each room may take in the store, with the adapters named after it.
+    pub room_quota: Quota,
     /// Memory budget of all uploads in progress together, bytes.
     pub upload_bytes: usize,
     /// Maximum size of a received message, bytes.
@@ -149,7 +159,7 @@ pub struct Config {
     pub queue: usize,
     /// Time limit of one request. A caller's deadline can only shorten it.
     pub longest: Duration,
-    /// Maximum number of open Track streams; further ones are refused.
+    /// Maximum number of open Track streams, divided between callers; further ones are refused.
     pub streams: usize,
     /// Key that authenticates resume tokens. Servers with the same key accept each other's tokens.
     pub token_key: TokenKey,
@@ -162,7 +172,8 @@ pub struct Config {
     pub reload: Reload,
     /// The server's metrics.
     pub metrics: Metrics,
-    /// Maximum number of connections; further ones are closed at once.
+    /// Maximum number of connections. Beyond it, one is closed for each new one: with `keyring` the
+    /// oldest without an authenticated call, otherwise the new one.
     pub connections: usize,
     /// The server's certificate; `None` for plain text.
     pub tls: Option<Arc<Tls>>,
@@ -184,6 +195,7 @@ impl Default for Config {
             response_timeout: Duration::from_secs(60),
             writable: false,
             thumbnails: false,
+            room_quota: Quota::default(),
             upload_bytes: 1 << 30,
             message_bytes: 4 << 20,
             threads: std::thread::available_parallelism().map_or(1, usize::from),
@@ -260,7 +272,8 @@ struct Handlers {
     phase: watch::Receiver<Phase>,
     workers: Workers,
     config: Arc<Config>,
-    streams: Arc<Semaphore>,
+    /// Places for open Track streams, divided between callers.
+    streams: Arc<Shares>,
     /// Applies changes of the catalog; `None` if the server is read-only.
     changes: Option<Arc<Changes>>,
 }
@@ -268,12 +281,16 @@ struct Handlers {
 impl Handlers {
     /// The current snapshot, limited to the rooms that the caller may see.
     fn snapshot<T>(&self, request: &Request<T>) -> Result<Arc<Snapshot>, Error> {
+        self.snapshot_for(principal(request).map(|principal| principal.rooms()))
+    }
+
+    /// The current snapshot, limited to the rooms of `scope`; `None` for all rooms.
+    fn snapshot_for(&self, scope: Option<&RoomScope>) -> Result<Arc<Snapshot>, Error> {
         let snapshot = match &*self.phase.borrow() {
             Phase::Serving(snapshot) | Phase::Draining(snapshot) => snapshot.clone(),
             Phase::Loading | Phase::Stopping => return Err(Error::Loading),
         };
 
-        let scope = principal(request).map(|principal| principal.rooms());
         Ok(match scope.filter(|scope| !scope.is_all()) {
             Some(scope) => Arc::new(snapshot.seen_by(scope)),
             None => snapshot,
@@ -340,7 +357,7 @@ pub async fn run(
         phase: watched.clone(),
         workers: workers.clone(),
         config: Arc::new(config.clone()),
-        streams: Arc::new(Semaphore::new(config.streams)),
+        streams: Shares::new(config.streams),
         changes: config.writable.then(|| Arc::new(changes)),
     };
     let answering = server(handlers, watched.clone(), grpc, async {
@@ -507,6 +524,7 @@ fn server(
 
     let memory = memory_layer(&handlers.config);
 
+    let has_credentials = keyring.is_some();
     let room_health = match &keyring {
         Some(_) => RoomHealth::Hidden,
         None => RoomHealth::Shown,
@@ -560,7 +578,13 @@ fn server(
         .add_service(CatalogServiceServer::new(handlers.clone()).max_decoding_message_size(most))
         .add_service(EvaluationServiceServer::new(handlers).max_decoding_message_size(most));
 
-    let incoming = connections::incoming(listener, connections, tls, metrics);
+    let acceptance = Acceptance {
+        most: connections,
+        has_credentials,
+        tls,
+        metrics,
+    };
+    let incoming = connections::incoming(listener, acceptance);
     Ok(async move {
         Ok(router
             .serve_with_incoming_shutdown(incoming, stopped)

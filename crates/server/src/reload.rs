@@ -10,6 +10,7 @@ use tokio::sync::{Notify, mpsc, oneshot, watch};
 
 use super::Phase;
 use super::metrics::{Metrics, ReloadOutcome};
+use super::slow_files::logged_if_slow;
 use super::snapshot::{Loader, Refused, Snapshot};
 
 /// When a server checks its store for changes.
@@ -73,7 +74,7 @@ pub(super) async fn keep_current(
             continue;
         };
 
-        let now = match loader.load(before.clone(), refused).await {
+        let now = match logged_if_slow("the store", loader.load(before.clone(), refused)).await {
             // A caller may remove the last room through this server; the store then remembers it.
             Ok(now)
                 if now.rooms().is_empty() && !(is_writable && loader.remembers_rooms().await) =>

@@ -51,6 +51,9 @@ pub enum Full {
     CallersUploads,
     /// The lane of fits.
     Fits,
+    /// The requests that wait for rooms or images to be read, or one caller's share of them.
+    #[strum(serialize = "requests that wait for the disk")]
+    DiskReads,
     /// The fits of one caller; only one is queued or runs at a time.
     #[strum(serialize = "fits of this caller")]
     CallersFits,
@@ -96,6 +99,8 @@ pub enum Error {
     #[error("the server is busy: the limit of {what} is reached; try again later")]
     #[strum(serialize = "BUSY")]
     Full { what: Full },
+    #[error("{used}; delete what is not needed, or ask the operator for a larger quota")]
+    Quota { used: String },
     #[error("this server has no such RPC")]
     #[strum(serialize = "UNKNOWN_RPC")]
     UnknownPath,
@@ -200,7 +205,7 @@ impl Error {
         match self {
             Self::Invalid { .. } => Code::InvalidArgument,
             Self::NotFound { .. } | Self::NotStored { .. } => Code::NotFound,
-            Self::Precondition(_) => Code::FailedPrecondition,
+            Self::Precondition(_) | Self::Quota { .. } => Code::FailedPrecondition,
             Self::Conflict { .. } => Code::Aborted,
             Self::Transport { code, .. } => *code,
             Self::Loading => Code::Unavailable,
@@ -406,6 +411,8 @@ mod tests {
                 },
                 "RESOURCE_EXHAUSTED",
             ),
+            (Error::Quota { used: name() }, "FAILED_PRECONDITION"),
+            (Error::UnknownPath, "UNIMPLEMENTED"),
             (Error::Unauthenticated { problem: "a" }, "UNAUTHENTICATED"),
             (
                 Error::Conflict {

@@ -43,11 +43,16 @@ impl MakeRequestId for RandomId {
     }
 }
 
+/// Maximum length of a path in logs and spans, bytes. Those of RPCs are shorter.
+const LONGEST_PATH: usize = 100;
+
 /// The span of a request. Its status is recorded later.
 pub fn span<B>(request: &Request<B>) -> Span {
     let id = request.headers().get(REQUEST_ID);
     let peer = request.extensions().get::<Peer>();
+    // An unknown path may be long.
     let path = request.uri().path();
+    let path = path.get(..LONGEST_PATH).unwrap_or(path);
     let span = tracing::info_span!(
         "request",
         id = id.and_then(|id| id.to_str().ok()).unwrap_or_default(),

@@ -1,6 +1,6 @@
 //! TLS with certificate files, which are reloaded when they change.
 
-use super::slow_files::read_within_limit;
+use super::slow_files::read_logged_if_slow;
 use seese3_core::Cause;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, PoisonError, RwLock};
@@ -14,8 +14,6 @@ use tokio_rustls::rustls::crypto::ring;
 use tokio_rustls::rustls::server::WebPkiClientVerifier;
 use tokio_rustls::rustls::{RootCertStore, ServerConfig};
 
-/// Maximum size of a certificate or key file, bytes.
-const MAX_FILE_BYTES: u64 = 16 << 20;
 /// Interval for checking the files for changes.
 const LOOK: Duration = Duration::from_secs(5);
 
@@ -91,7 +89,7 @@ impl Tls {
             tokio::time::sleep(LOOK).await;
 
             let files = self.files.clone();
-            let found = read_within_limit("the certificate files", move || read(&files));
+            let found = read_logged_if_slow("the certificate files", move || read(&files));
             let Ok(found) = found.await else {
                 return;
             };
@@ -124,10 +122,12 @@ fn read(files: &TlsFiles) -> Result<(ServerConfig, [u8; 32]), TlsError> {
     let mut digest = Sha256::new();
     let mut content = |option, file: &Path| {
         let bytes =
-            seese3_files::read(file, MAX_FILE_BYTES).map_err(|problem| TlsError::Unreadable {
-                option,
-                file: file.to_owned(),
-                problem,
+            seese3_files::read(file, seese3_files::SMALL_FILE_BYTES).map_err(|problem| {
+                TlsError::Unreadable {
+                    option,
+                    file: file.to_owned(),
+                    problem,
+                }
             })?;
         digest.update((bytes.len() as u64).to_le_bytes());
         digest.update(&bytes);

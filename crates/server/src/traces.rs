@@ -4,6 +4,7 @@
 //! that trace is sampled. Any other request starts a new trace. A background thread sends spans
 //! from a bounded queue, so a slow or absent collector does not delay requests.
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use http::HeaderMap;
@@ -12,8 +13,11 @@ use opentelemetry::propagation::{Extractor, TextMapPropagator};
 use opentelemetry::trace::{Status, TracerProvider};
 use opentelemetry_otlp::{SpanExporter, WithExportConfig};
 use opentelemetry_sdk::Resource;
+use opentelemetry_sdk::error::OTelSdkResult;
 use opentelemetry_sdk::propagation::TraceContextPropagator;
-use opentelemetry_sdk::trace::{Sampler, SdkTracer, SdkTracerProvider};
+use opentelemetry_sdk::trace::{
+    Sampler, SdkTracer, SdkTracerProvider, SpanData, SpanExporter as ExportSpans,
+};
 use tonic::Code;
 use tracing::{Span, Subscriber};
 use tracing_opentelemetry::{OpenTelemetryLayer, OpenTelemetrySpanExt};
@@ -21,8 +25,14 @@ use tracing_subscriber::Layer;
 use tracing_subscriber::filter::{FilterExt, LevelFilter, filter_fn};
 use tracing_subscriber::registry::LookupSpan;
 
+use super::status::brief;
+
 /// Timeout of one export, and of the last export at shutdown.
 const EXPORT: Duration = Duration::from_secs(5);
+
+/// Maximum length of a caller's trace header, bytes. W3C Trace Context asks for 512 of `tracestate`; a
+/// longer one is left out.
+const LONGEST_HEADER: usize = 512;
 
 /// A span exporter. Dropping it sends the queued spans.
 #[derive(Debug)]
@@ -50,7 +60,10 @@ impl Traces {
             .with_attribute(KeyValue::new("service.version", env!("CARGO_PKG_VERSION")))
             .build();
         let provider = SdkTracerProvider::builder()
-            .with_batch_exporter(exporter)
+            .with_batch_exporter(LoggedExporter {
+                exporter,
+                fails: AtomicBool::new(false),
+            })
             .with_resource(resource)
             .with_sampler(Sampler::ParentBased(Box::new(Sampler::AlwaysOn)))
             .build();
@@ -73,6 +86,45 @@ impl Traces {
                 .with_max_level_hint(LevelFilter::INFO)
                 .and(LevelFilter::INFO),
         )
+    }
+}
+
+/// An exporter whose failures are logged when they begin and end. OpenTelemetry logs each of them, and
+/// what the collector says.
+#[derive(Debug)]
+struct LoggedExporter {
+    exporter: SpanExporter,
+    fails: AtomicBool,
+}
+
+impl ExportSpans for LoggedExporter {
+    async fn export(&self, batch: Vec<SpanData>) -> OTelSdkResult {
+        let result = self.exporter.export(batch).await;
+        let failed_before = self.fails.swap(result.is_err(), Ordering::Relaxed);
+        match &result {
+            Err(error) if !failed_before => {
+                let error = brief(&error.to_string());
+                tracing::warn!(
+                    error,
+                    "spans cannot be exported; they are lost until they can"
+                );
+            }
+            Ok(()) if failed_before => tracing::info!("spans are exported again"),
+            _ => {}
+        }
+        result
+    }
+
+    fn shutdown_with_timeout(&self, timeout: Duration) -> OTelSdkResult {
+        self.exporter.shutdown_with_timeout(timeout)
+    }
+
+    fn force_flush(&self) -> OTelSdkResult {
+        self.exporter.force_flush()
+    }
+
+    fn set_resource(&mut self, resource: &Resource) {
+        self.exporter.set_resource(resource);
     }
 }
 
@@ -127,7 +179,8 @@ struct Headers<'a>(&'a HeaderMap);
 
 impl Extractor for Headers<'_> {
     fn get(&self, key: &str) -> Option<&str> {
-        self.0.get(key).and_then(|value| value.to_str().ok())
+        let value = self.0.get(key).and_then(|value| value.to_str().ok());
+        value.filter(|value| value.len() <= LONGEST_HEADER)
     }
 
     fn keys(&self) -> Vec<&str> {

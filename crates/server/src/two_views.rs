@@ -11,11 +11,15 @@ use seese3_robot::two_view::{self, MotionEstimate};
 /// Maximum relative deviation of an image's aspect ratio from the camera's.
 const SHAPE_TOLERANCE: f64 = 0.02;
 
+/// Minimum width and height of an image, pixels. Encoders of keypoints describe a point by its
+/// surroundings, some dozens of pixels wide; enlarging a smaller image would only invent them.
+const LEAST_SIDE: usize = 32;
+
 /// Estimates the motion between two images of one camera. `encoder` detects keypoints.
 ///
 /// # Errors
-/// [`Error::Invalid`] on the field of an image that cannot be decoded, or has another aspect ratio
-/// than the camera's images.
+/// [`Error::Invalid`] on the field of an image that cannot be decoded, is smaller than
+/// [`LEAST_SIDE`], or has another aspect ratio than the camera's images.
 pub fn estimate(
     encoder: &ImageEncoder,
     images: [&[u8]; 2],
@@ -26,6 +30,12 @@ pub fn estimate(
         cancel.check()?;
         let image = encoder.decoded(field, image)?;
         let [width, height] = [image.width, image.height];
+        if width.min(height) < LEAST_SIDE {
+            let problem = format!(
+                "is {width}×{height} pixels, too small for keypoints; send at least {LEAST_SIDE} each way"
+            );
+            return Err(Error::invalid(field, problem));
+        }
         let shape = height as f64 / width as f64;
         if (shape / camera.height() - 1.0).abs() > SHAPE_TOLERANCE {
             return Err(Error::invalid(

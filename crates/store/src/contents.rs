@@ -1,6 +1,7 @@
 //! Listing of a store's contents, by revision.
 
 use strum::VariantArray;
+use tokio_stream::StreamExt;
 
 use super::defaults::Defaults;
 use super::format::{AdapterBody, RoomBody};
@@ -41,7 +42,46 @@ pub struct ManifestSummary {
     pub about: String,
 }
 
+/// What a room or an adapter takes in the store.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Usage {
+    /// Number of revisions.
+    pub revisions: u64,
+    /// Size of all files, bytes; those of removed revisions count until they are collected as
+    /// garbage.
+    pub bytes: u64,
+}
+
 impl Store {
+    /// What a room or an adapter takes in the store; nothing if it is not there. A revision that
+    /// `resource` names is ignored.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if the store cannot be listed.
+    pub async fn usage(&self, resource: &ResourceName) -> Result<Usage, Error> {
+        let folder = folder_of(resource.kind, &resource.name);
+        let mut usage = Usage {
+            revisions: self.revisions(&folder).await?.present.len() as u64,
+            bytes: 0,
+        };
+
+        let mut files = self.objects.list(Some(&folder));
+        while let Some(file) = files.next().await {
+            usage.bytes += file.map_err(|error| self.io(&folder, error))?.size;
+        }
+        Ok(usage)
+    }
+
+    /// The names of all rooms, or adapters, with files in the store, also of those whose revisions were
+    /// all removed; sorted.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if the store cannot be listed.
+    pub async fn names_with_files(&self, kind: Kind) -> Result<Vec<String>, Error> {
+        let folders = self.folders(kind).await?;
+        Ok(folders.into_iter().map(|(name, _)| name).collect())
+    }
+
     /// All rooms, then all adapters, each sorted by name.
     ///
     /// # Errors

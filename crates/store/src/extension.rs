@@ -6,7 +6,7 @@ use std::sync::Arc;
 use ndarray::{Axis, concatenate, s};
 
 use super::room_keypoints::RoomKeypoints;
-use super::rooms::{PublishPolicy, RoomContents};
+use super::room_publishing::{PublishPolicy, RoomContents};
 use super::{
     ATTEMPTS, Error, Kind, Published, RoomSummary, Store, StoredRoom, check_features, revision_path,
 };

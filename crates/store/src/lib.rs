@@ -52,6 +52,7 @@ mod garbage;
 mod removal;
 mod room_fit;
 mod rooms;
+mod room_publishing;
 mod adapter_files;
 mod extension;
 mod map_edits;
@@ -59,7 +60,7 @@ mod adapters;
 
 pub use adapter_files::{check_adapter_files, stated_weights_size};
 
-pub use contents::{Contents, RevisionContents};
+pub use contents::{Contents, RevisionContents, Usage};
 pub use defaults::{Choice, Defaults, StandingDefaults};
 pub use extension::{ExtendedRoom, OtherFeatures};
 pub use garbage::{Garbage, GarbageFile, GarbagePolicy, Publishers};
@@ -68,7 +69,8 @@ pub use publication::{Clock, GRACE, LONGEST_PUBLICATION};
 pub use removal::Removed;
 pub use resource::{Kind, ResourceName, ResourceNameError};
 pub use room_keypoints::{HeaderError, KeypointsHeader, RoomKeypoints};
-pub use rooms::{RoomContents, RoomSummary, StoredRoom, check_features};
+pub use room_publishing::{RoomContents, check_features};
+pub use rooms::{RoomSummary, StoredRoom};
 pub use stored_adapter::{BaseAdapter, RoomFit, StoredAdapter};
 pub use verification::Finding;
 
@@ -82,7 +84,6 @@ use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt, PutMode, PutOptions, PutPayload};
 use publication::Publication;
 use sha2::{Digest, Sha256};
-use tokio_stream::StreamExt;
 
 /// Errors of reading and writing the store. Each message names the file, room or adapter and, where
 /// there is a remedy, the remedy.
@@ -608,13 +609,10 @@ impl Store {
     /// The numbers of the files in a folder.
     async fn numbered_files(&self, folder: &Path) -> Result<Numbers, Error> {
         self.check_folder(folder)?;
-        let mut listed = self.objects.list(Some(folder));
         let mut numbers = Numbers::default();
         let mut gone = BTreeSet::new();
 
-        while let Some(entry) = listed.next().await {
-            let entry = entry.map_err(|error| self.io(folder, error))?;
-            let name = entry.location.filename().unwrap_or_default();
+        for name in &self.file_names(folder).await? {
             let Some((number, extension)) = name.split_once('.') else {
                 continue;
             };
@@ -624,8 +622,8 @@ impl Store {
 
             // Only canonical names count: a copy such as `2.json` is not a revision.
             match extension {
-                "json" if name == manifest_name(number) => numbers.present.push(number),
-                "gone" if name == gone_name(number) => {
+                "json" if *name == manifest_name(number) => numbers.present.push(number),
+                "gone" if *name == gone_name(number) => {
                     gone.insert(number);
                 }
                 _ => continue,
@@ -638,6 +636,34 @@ impl Store {
         numbers.present.retain(|number| !gone.contains(number));
         numbers.present.sort_unstable();
         Ok(numbers)
+    }
+
+    /// The names of the files in a folder. In a folder of this machine, only the names are read:
+    /// the object store would also ask for the size and the time of each file.
+    async fn file_names(&self, folder: &Path) -> Result<Vec<String>, Error> {
+        let Some(root) = &self.folder else {
+            let listed = self.objects.list_with_delimiter(Some(folder)).await;
+            let listed = listed.map_err(|error| self.io(folder, error))?;
+            let names = listed
+                .objects
+                .iter()
+                .filter_map(|file| file.location.filename());
+            return Ok(names.map(str::to_owned).collect());
+        };
+
+        let io = |cause: std::io::Error| Error::Io {
+            file: self.shown(folder),
+            cause: cause.into(),
+        };
+        let entries = match std::fs::read_dir(root.join(folder.as_ref())) {
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
+            entries => entries.map_err(io)?,
+        };
+        let mut names = Vec::new();
+        for entry in entries {
+            names.extend(entry.map_err(io)?.file_name().into_string());
+        }
+        Ok(names)
     }
 
     /// The folder of a room or adapter, and the requested revision or else the current one: the

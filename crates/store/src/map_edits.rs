@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::extension::{OtherFeatures, extended};
-use super::rooms::RoomContents;
+use super::room_publishing::RoomContents;
 use super::{Error, RoomKeypoints, StoredRoom};
 use seese3_core::features::Features;
 use seese3_core::room::{FrameId, Frames, Provenance, Room, RoomId};

@@ -5,6 +5,7 @@
 //! The objects remain until [`Store::collect_garbage`] finds them unreferenced.
 
 use object_store::ObjectStoreExt;
+use object_store::path::Path;
 
 use super::defaults::{Choice, Defaults};
 use super::{Error, Kind, ResourceName, Store, folder_of, gone_name, revision_path};
@@ -70,23 +71,28 @@ impl Store {
 
         // Oldest first, so that an older revision never becomes the newest.
         for &revision in &removed.revisions {
-            let manifest = revision_path(&folder, revision);
-            let gone = folder.clone().join("revisions").join(gone_name(revision));
-            let bytes = self.read(&manifest).await?;
-            if let Err(error) = self.write_new(&gone, bytes).await {
-                // On a full disk, hard-linking the manifest still works, and removal must work
-                // there to free space.
-                match self.objects.copy_if_not_exists(&manifest, &gone).await {
-                    Ok(()) | Err(object_store::Error::AlreadyExists { .. }) => {}
-                    Err(_) => return Err(error),
-                }
-            }
-
-            let deleted = self.objects.delete(&manifest).await;
-            deleted.map_err(|error| self.io(&manifest, error))?;
+            self.retire(&folder, revision).await?;
         }
 
         Ok(removed)
+    }
+
+    /// Removes a revision. Its number is not used again.
+    pub(super) async fn retire(&self, folder: &Path, revision: u64) -> Result<(), Error> {
+        let manifest = revision_path(folder, revision);
+        let gone = folder.clone().join("revisions").join(gone_name(revision));
+        let bytes = self.read(&manifest).await?;
+        if let Err(error) = self.write_new(&gone, bytes).await {
+            // On a full disk, hard-linking the manifest still works, and removal must work there to
+            // free space.
+            match self.objects.copy_if_not_exists(&manifest, &gone).await {
+                Ok(()) | Err(object_store::Error::AlreadyExists { .. }) => {}
+                Err(_) => return Err(error),
+            }
+        }
+
+        let deleted = self.objects.delete(&manifest).await;
+        deleted.map_err(|error| self.io(&manifest, error))
     }
 
     /// The fitted adapters whose base is one of these revisions of an adapter.

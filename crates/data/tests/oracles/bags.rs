@@ -328,6 +328,28 @@ impl Changed {
     }
 }
 
+/// Oracle: the contract: columns and tables that compute their content are refused. Such a file of a
+/// few kilobytes would be read for hours.
+#[test]
+fn computed_tables_are_refused() {
+    let generated = "ALTER TABLE messages RENAME TO kept; CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id INTEGER, \
+                     timestamp INTEGER, data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL); \
+                     INSERT INTO messages (id, topic_id, timestamp) SELECT id, topic_id, timestamp FROM kept;";
+    let view = "ALTER TABLE messages RENAME TO kept; CREATE VIEW messages AS SELECT * FROM kept;";
+    let virtual_table = "DROP TABLE messages; CREATE VIRTUAL TABLE messages USING fts5(id, topic_id, timestamp, data);";
+    for sql in [generated, view, virtual_table] {
+        let refused = Changed::new(sql).read("/camera/raw", Unusable::Drop);
+        let Err(refused) = refused else {
+            panic!("{sql}");
+        };
+        let problem = refused.to_string();
+        assert!(
+            problem.contains("without the table 'messages' of plain columns"),
+            "{problem}"
+        );
+    }
+}
+
 /// Oracle: by hand. Messages 4, 7, 11, 17, 23, 27 and 29 are the compressed images, of which the
 /// last lies behind the last pose, and 1, 9, 13, 15, 19, 21 and 25 the odometry.
 #[test]

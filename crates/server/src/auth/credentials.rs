@@ -26,10 +26,11 @@ use subtle::ConstantTimeEq;
 use tokio::sync::watch;
 
 use super::super::Error;
-use super::super::slow_files::read_within_limit;
+use super::super::quota::Quota;
+use super::super::slow_files::read_logged_if_slow;
 use super::issuer_form::IssuerForm;
 use super::issuers::Issuer;
-use super::{MAX_FILE_BYTES, Principal, Rights, RoomScope, Signed, Verb};
+use super::{Principal, Rights, RoomScope, Signed, Verb};
 
 /// Polling interval of the file.
 const LOOK: Duration = Duration::from_secs(5);
@@ -88,6 +89,8 @@ struct PrincipalForm {
     rooms: Vec<String>,
     streams: Option<usize>,
     requests: Option<usize>,
+    stored_revisions: Option<u64>,
+    stored_bytes: Option<u64>,
 }
 
 /// Proof of a caller's identity.
@@ -115,12 +118,13 @@ impl Credentials {
     /// [`AuthError`], which names the principal or issuer and the key. A file without principals
     /// and issuers is rejected: it would lock out every caller.
     pub fn read(file: &Path) -> Result<Self, AuthError> {
-        let text = seese3_files::read_text(file, MAX_FILE_BYTES).map_err(|problem| {
-            AuthError::Unreadable {
-                file: file.to_owned(),
-                problem,
-            }
-        })?;
+        let text =
+            seese3_files::read_text(file, seese3_files::SMALL_FILE_BYTES).map_err(|problem| {
+                AuthError::Unreadable {
+                    file: file.to_owned(),
+                    problem,
+                }
+            })?;
 
         Self::of(file, &text)
     }
@@ -282,6 +286,8 @@ fn principal(form: PrincipalForm) -> Result<(Proof, Principal), String> {
         rooms,
         streams,
         requests,
+        stored_revisions,
+        stored_bytes,
     } = form;
 
     let proof = match (token_sha256, certificate_sha256) {
@@ -295,18 +301,26 @@ fn principal(form: PrincipalForm) -> Result<(Proof, Principal), String> {
     if name.is_empty() || name.chars().any(char::is_control) {
         return Err("name must be one line of text".to_owned());
     }
-    let rights = rights(name, verbs, rooms, [streams, requests])?;
+    let mut rights = rights(name, verbs, rooms, [streams, requests])?;
+    rights.quota = Quota {
+        revisions: stored_revisions,
+        bytes: stored_bytes,
+    };
     Ok((proof, Principal::new(rights)))
 }
 
 fn issuer(form: IssuerForm, file: &Path) -> Result<Issuer, String> {
     let limits = [form.streams, form.requests];
-    let rights = rights(
+    let mut rights = rights(
         form.issuer.clone(),
         form.verbs.clone(),
         form.rooms.clone(),
         limits,
     )?;
+    rights.quota = Quota {
+        revisions: form.stored_revisions,
+        bytes: form.stored_bytes,
+    };
     Issuer::new(form, rights, file.parent().unwrap_or(Path::new("")))
 }
 
@@ -340,6 +354,7 @@ fn rights(
         name: name.into(),
         verbs,
         rooms: RoomScope(vec![rooms]),
+        quota: Quota::default(),
     })
 }
 
@@ -387,7 +402,7 @@ impl Keyring {
         tokio::select! {
             // An error means that the server has stopped.
             _ = changed => {}
-            () = passed(until) => {}
+            () = passed(until, SystemTime::now) => {}
         }
     }
 
@@ -398,7 +413,7 @@ impl Keyring {
 
         loop {
             let file = self.file.clone();
-            let credentials = read_within_limit("--auth-file", move || Credentials::read(&file));
+            let credentials = read_logged_if_slow("--auth-file", move || Credentials::read(&file));
             let Ok(credentials) = credentials.await else {
                 return;
             };
@@ -422,12 +437,18 @@ impl Keyring {
     }
 }
 
-/// Completes at a system time; never if `until` is `None`.
-async fn passed(until: Option<SystemTime>) {
+/// The time from `now` until `until`; `None` if that has come.
+fn left(until: SystemTime, now: SystemTime) -> Option<Duration> {
+    let left = until.duration_since(now).ok();
+    left.filter(|left| !left.is_zero())
+}
+
+/// Completes when the system clock `now` reaches a time; never if `until` is `None`.
+async fn passed(until: Option<SystemTime>, now: impl Fn() -> SystemTime) {
     let Some(until) = until else {
         return std::future::pending().await;
     };
-    while let Ok(left) = until.duration_since(SystemTime::now()) {
+    while let Some(left) = left(until, now()) {
         // The clock may be adjusted during the wait, so wake up regularly.
         tokio::time::sleep(left.min(Duration::from_secs(60))).await;
     }
@@ -435,6 +456,8 @@ async fn passed(until: Option<SystemTime>) {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::{AtomicI64, Ordering};
+
     use super::*;
 
     /// SHA-256 of "secret", as `printf %s secret | sha256sum` prints it.
@@ -517,16 +540,40 @@ mod tests {
         keyring.revoked(&other_one).await;
     }
 
-    /// Oracle: the clock: streams of a token do not end before the token expires.
-    #[tokio::test]
+    /// Oracle: the definition, on a simulated clock: a token of one hour ends after one hour; a
+    /// clock that is set back or forward in between is noticed within a minute.
+    #[tokio::test(start_paused = true)]
     async fn a_token_holds_until_it_ends() {
-        let begun = SystemTime::now();
-        passed(Some(begun + Duration::from_millis(200))).await;
-        assert!(begun.elapsed().unwrap() >= Duration::from_millis(200));
-        passed(Some(SystemTime::UNIX_EPOCH)).await;
+        let started = tokio::time::Instant::now();
+        let set_forward_s = AtomicI64::new(0);
+        let now = || {
+            let ahead = set_forward_s.load(Ordering::Relaxed);
+            let since_1970 = 1_000_000 + started.elapsed().as_secs() as i64 + ahead;
+            SystemTime::UNIX_EPOCH + Duration::from_secs(since_1970 as u64)
+        };
+        let hour = Duration::from_secs(3_600);
+        let adjust = async |seconds| {
+            tokio::time::sleep(hour / 2).await;
+            set_forward_s.fetch_add(seconds, Ordering::Relaxed);
+        };
 
-        // Nothing is to come: a slow machine cannot fail this.
-        let never = tokio::time::timeout(Duration::from_millis(50), passed(None));
+        // By how much the clock is set after half an hour, and when the token ends.
+        for (seconds, least_s, most_s) in [
+            (0, 3_600, 3_600),
+            (-600, 4_200, 4_200),
+            (7_200, 1_800, 1_860),
+        ] {
+            let began = tokio::time::Instant::now();
+            tokio::join!(passed(Some(now() + hour), now), adjust(seconds));
+            let took_s = began.elapsed().as_secs();
+            assert!(
+                (least_s..=most_s).contains(&took_s),
+                "set by {seconds} s: {took_s} s"
+            );
+        }
+
+        passed(Some(SystemTime::UNIX_EPOCH), now).await;
+        let never = tokio::time::timeout(100 * hour, passed(None, now));
         assert!(never.await.is_err());
     }
 }

@@ -15,6 +15,8 @@ pub struct IssuerForm {
     pub rooms: Vec<String>,
     pub streams: Option<usize>,
     pub requests: Option<usize>,
+    pub stored_revisions: Option<u64>,
+    pub stored_bytes: Option<u64>,
 }
 
 /// Tolerated clock difference between an issuer and this server, seconds.

@@ -25,7 +25,7 @@ use std::time::{Duration, SystemTime};
 use super::super::Error;
 use super::issuer_form::{IssuerForm, LEEWAY_S};
 use super::signed_tokens::{Claims, PublicKey};
-use super::{MAX_FILE_BYTES, Places, Principal, Rights, RoomScope, Signed, Verb};
+use super::{Places, Principal, Rights, RoomScope, Signed, Verb};
 
 /// Maximum length of a subject name, characters.
 const LONGEST_SUBJECT: usize = 200;
@@ -69,7 +69,7 @@ impl Issuer {
         let mut keys = Vec::new();
         for name in &form.public_keys {
             let unfit = |problem: String| format!("public_keys: {name}: {problem}");
-            let pem = seese3_files::read(&folder.join(name), MAX_FILE_BYTES)
+            let pem = seese3_files::read(&folder.join(name), seese3_files::SMALL_FILE_BYTES)
                 .map_err(|error| unfit(format!("cannot be read: {error}")))?;
             let key = PublicKey::new(&pem, &form).map_err(unfit)?;
             pems.push(pem);

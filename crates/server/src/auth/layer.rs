@@ -134,6 +134,9 @@ impl AuthLayer {
         };
 
         let principal = caller(keyring, request)?;
+        if let Some(peer) = request.extensions().get::<Peer>() {
+            peer.authenticated();
+        }
         tracing::Span::current().record("principal", principal.name());
 
         // Without credentials, all unknown paths are refused above as unauthenticated.

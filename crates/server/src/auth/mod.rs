@@ -21,13 +21,11 @@ pub use layer::AuthLayer;
 use std::sync::Arc;
 use std::time::SystemTime;
 
+use super::quota::Quota;
 use issuers::Issuer;
 use serde::Deserialize;
 use strum::IntoStaticStr;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
-
-/// Maximum size of the auth file, or of a key file, bytes.
-const MAX_FILE_BYTES: u64 = 16 << 20;
 
 /// The permission that an RPC requires; each RPC requires one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, IntoStaticStr)]
@@ -80,6 +78,8 @@ struct Rights {
     streams: usize,
     /// Maximum number of concurrent requests and streams.
     requests: usize,
+    /// The most that its rooms may take in the store.
+    quota: Quota,
 }
 
 /// Semaphores of a caller's concurrency limits.
@@ -132,6 +132,11 @@ impl Principal {
     /// The caller's name, shared.
     pub fn shared_name(&self) -> Arc<str> {
         self.rights.name.clone()
+    }
+
+    /// The most that its rooms may take in the store.
+    pub fn quota(&self) -> Quota {
+        self.rights.quota
     }
 
     /// The rooms that it may access.

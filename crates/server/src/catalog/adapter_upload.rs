@@ -52,9 +52,11 @@ impl Handlers {
         let identity = identity(&caller, &upload.request_id, "PublishAdapter", &content);
         let store = changes.store.clone();
         let published_as = name.name.clone();
+        let quotas = changes.quotas(&caller);
         let change = async move {
             // Uploaded data counts toward the limit until it is stored.
             let _memory = memory;
+            quotas.check_caller().await?;
             store
                 .publish_adapter_files(&name.name, &upload.manifest, weights)
                 .await

@@ -12,6 +12,7 @@ use tracing::Instrument;
 
 use super::super::caller::{CallerId, Requester};
 use super::super::metrics::Metrics;
+use super::super::quota::Quota;
 use super::super::reload::ReloadHandle;
 use super::super::shares::{Exhausted, Share, Shares};
 use super::super::snapshot::Snapshot;
@@ -30,6 +31,8 @@ const MOST_WAITING: usize = 64;
 /// State shared by all catalog changes.
 pub struct Changes {
     pub store: Store,
+    /// What may be stored of each room.
+    pub quota: Quota,
     reload: ReloadHandle,
     recent: Arc<Mutex<Recent>>,
     /// Places of queued and running changes.
@@ -45,6 +48,7 @@ impl Changes {
     pub fn new(store: Store, reload: ReloadHandle, config: &Config) -> Self {
         Self {
             store,
+            quota: config.room_quota,
             reload,
             recent: Arc::default(),
             waiting: Shares::new(MOST_WAITING),
@@ -67,13 +71,7 @@ impl Changes {
         change: impl Future<Output = Result<T, Error>> + Send + 'static,
         answer: impl FnOnce(T) -> A + Send + 'static,
     ) -> Result<A, Error> {
-        let waiting = self.waiting.take(identity.charged.clone(), 1);
-        let waiting = waiting.map_err(|limit| {
-            self.full(match limit {
-                Exhausted::Budget => Full::Changes,
-                Exhausted::Share => Full::CallersChanges,
-            })
-        })?;
+        let waiting = self.place(&identity.charged)?;
 
         let changes = self.clone();
         let made = tokio::spawn(
@@ -98,6 +96,31 @@ impl Changes {
         made.await.unwrap_or_else(|error| {
             tracing::error!(%error, "a change panicked");
             Err(Error::Internal)
+        })
+    }
+
+    /// Runs the checks of a `validate_only` request on a blocking thread, within the caller's share of
+    /// queued changes.
+    ///
+    /// # Errors
+    /// The errors of the check; [`Error::Full`] if too many changes are queued.
+    pub async fn validated<T: Send + 'static>(
+        &self,
+        caller: &CallerId,
+        check: impl Future<Output = Result<T, Error>> + Send + 'static,
+    ) -> Result<T, Error> {
+        let _place = self.place(caller)?;
+        on_blocking_thread(check).await?
+    }
+
+    /// A place among the queued changes.
+    fn place(&self, caller: &CallerId) -> Result<Share, Error> {
+        let place = self.waiting.take(caller.clone(), 1);
+        place.map_err(|limit| {
+            self.full(match limit {
+                Exhausted::Budget => Full::Changes,
+                Exhausted::Share => Full::CallersChanges,
+            })
         })
     }
 
@@ -208,12 +231,9 @@ impl Handlers {
     ///
     /// # Errors
     /// As [`Handlers::changes`].
-    pub(super) async fn reloaded<T>(
-        &self,
-        request: &tonic::Request<T>,
-    ) -> Result<Arc<Snapshot>, Error> {
+    pub(super) async fn reloaded(&self, caller: &Requester) -> Result<Arc<Snapshot>, Error> {
         self.changes()?.reload.now().await;
-        self.snapshot(request)
+        self.snapshot_for(caller.scope())
     }
 
     /// Whether a room is currently served with this revision of an adapter.

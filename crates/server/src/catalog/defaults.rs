@@ -15,7 +15,6 @@ impl Handlers {
     pub(super) async fn set(
         &self,
         caller: Requester,
-        snapshot: &Snapshot,
         request: pb::SetDefaultRequest,
     ) -> Result<pb::SetDefaultResponse, Error> {
         use pb::set_default_request::Default as Wire;
@@ -49,7 +48,8 @@ impl Handlers {
                     return Err(Error::invalid("adapter", problem));
                 }
                 let adapter = named_whole("adapter", &adapter, Kind::Adapter)?.name;
-                check_default_adapter(snapshot, &resource.name, &adapter)?;
+                let snapshot = self.reloaded(&caller).await?;
+                check_default_adapter(&snapshot, &resource.name, &adapter)?;
                 Choice::Adapter {
                     room: resource.name,
                     adapter,
@@ -59,8 +59,12 @@ impl Handlers {
 
         let changes = self.changes()?.clone();
         if validate_only {
-            changes.store.check_choice(&choice).await?;
-            let defaults = changes.store.defaults().await?;
+            let store = changes.store.clone();
+            let check = async move {
+                store.check_choice(&choice).await?;
+                Ok(store.defaults().await?)
+            };
+            let defaults = changes.validated(&caller.id, check).await?;
             let defaults = defaults_to_wire(&defaults, caller.scope());
             return Ok(pb::SetDefaultResponse { defaults });
         }
@@ -134,12 +138,12 @@ impl Handlers {
         answer: impl Fn(Vec<u64>) -> A + Send + 'static,
     ) -> Result<A, Error> {
         let changes = self.changes()?.clone();
+        let store = changes.store.clone();
         if validate_only {
-            let removed = changes.store.check_removable(&resource).await?;
-            return Ok(answer(removed.revisions));
+            let check = async move { Ok(store.check_removable(&resource).await?.revisions) };
+            return Ok(answer(changes.validated(&identity.charged, check).await?));
         }
 
-        let store = changes.store.clone();
         let change = async move { Ok(store.remove(&resource).await?.revisions) };
         changes.once(identity, change, answer).await
     }

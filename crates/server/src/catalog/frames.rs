@@ -7,14 +7,17 @@ use tonic::{Request, Response, Status};
 
 use super::super::convert;
 use super::super::cost::frame_bytes;
+use super::super::decoding::DecodingMemory;
 use super::super::memory::hold_for_answer;
 use super::super::snapshot::Snapshot;
+use super::super::status::Full;
+use super::super::workers::off_the_lane;
 use super::super::{Error, Handlers};
 use super::page_length;
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
 use seese3_core::room::{FrameId, Room};
-use seese3_encoder::thumbnail;
+use seese3_encoder::{decoding_cost, read_image_bytes, thumbnail};
 use seese3_robot::planning::PoseGraph;
 
 /// Maximum number of neighbors per frame.
@@ -111,7 +114,7 @@ fn answer(
                 .collect();
         }
         if let Some(width) = thumbnail_width {
-            wire.thumbnail = picture(room, frame, width);
+            wire.thumbnail = picture(room, frame, width, snapshot.decoding())?;
             picture_bytes += wire.thumbnail.len();
         }
         frames.push(wire);
@@ -169,15 +172,29 @@ fn frame_to_wire(room: &Room, frame: FrameId) -> pb::RoomFrame {
 }
 
 /// The thumbnail of a frame; empty if its image cannot be read.
-fn picture(room: &Room, frame: FrameId, width: u32) -> Vec<u8> {
+fn picture(
+    room: &Room,
+    frame: FrameId,
+    width: u32,
+    decoding: &DecodingMemory,
+) -> Result<Vec<u8>, Error> {
     let root = Path::new(&room.provenance().images_root);
     let image = &room.images()[frame.row()];
 
-    thumbnail(root, image, width as usize).unwrap_or_else(|error| {
+    // The folder of the images may not answer.
+    let read = off_the_lane(|| read_image_bytes(root, image));
+    let what = Full::DiskReads;
+    let read = read.map_err(|_| Error::Full { what })?;
+    let picture = read.and_then(|bytes| {
+        let cost = decoding_cost(&bytes).map_or(0, |cost| cost.bytes);
+        let _memory = decoding.wait(cost);
+        thumbnail(image, &bytes, width as usize)
+    });
+    Ok(picture.unwrap_or_else(|error| {
         // Paths go only to the operator's log.
         tracing::warn!(room = %room.id(), frame = frame.0, %error, "no thumbnail");
         Vec::new()
-    })
+    }))
 }
 
 fn no_thumbnails(problem: &str) -> Error {

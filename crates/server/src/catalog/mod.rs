@@ -4,6 +4,7 @@
 //! | --- | --- |
 //! | `changes` | common steps of all changes: one at a time, reload of the store, stored responses |
 //! | `recent` | stored responses to recent changes, for idempotent retries |
+//! | `quotas` | limits on what rooms and callers may have in the store |
 //! | `keypoints_upload` | the keypoints of an uploaded room |
 //! | `room_upload` | uploads a room, in batches of frames |
 //! | `adapter_upload` | uploads an adapter |
@@ -16,6 +17,7 @@ mod changes;
 mod defaults;
 mod frames;
 mod keypoints_upload;
+mod quotas;
 mod recent;
 mod refits;
 mod room_upload;
@@ -153,8 +155,7 @@ impl CatalogService for Handlers {
     ) -> Result<Response<Self::RefitRoomStream>, Status> {
         let caller = Requester::of(&request);
         let context = self.workers.context(&request);
-        let snapshot = self.reloaded(&request).await?;
-        let admitted = self.admit_refit(&caller, &snapshot, request.into_inner())?;
+        let admitted = self.admit_refit(&caller, request.into_inner()).await?;
 
         let (events, heard) = mpsc::channel(16);
         tokio::spawn(self.clone().run_refit(admitted, context, events));
@@ -166,8 +167,7 @@ impl CatalogService for Handlers {
         request: Request<pb::SetDefaultRequest>,
     ) -> Result<Response<pb::SetDefaultResponse>, Status> {
         let caller = Requester::of(&request);
-        let snapshot = self.reloaded(&request).await?;
-        let answer = self.set(caller, &snapshot, request.into_inner()).await?;
+        let answer = self.set(caller, request.into_inner()).await?;
         Ok(Response::new(answer))
     }
 

@@ -1,7 +1,9 @@
 //! Stored responses to recent changes, so that a retry does not repeat the change.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::time::{Duration, Instant};
+use std::time::Duration;
+
+use tokio::time::Instant;
 
 use super::super::Error;
 use super::super::caller::CallerId;
@@ -11,6 +13,8 @@ const KEPT_FOR: Duration = Duration::from_secs(3_600);
 /// Maximum number of stored responses. Above it, the caller with the most responses loses its
 /// oldest, so that heavy callers cannot evict those of others.
 const KEPT: usize = 1_000;
+/// Maximum size of a stored response, bytes.
+const LARGEST_ANSWER: usize = 16 << 10;
 /// Maximum length of a request id, characters.
 const LONGEST_ID: usize = 100;
 
@@ -73,9 +77,13 @@ impl Recent {
         }
     }
 
-    /// Stores the response to a change.
+    /// Stores the response to a change, unless it is large.
     pub fn remember(&mut self, identity: Identity, answer: Vec<u8>) {
         if identity.request_id.is_empty() {
+            return;
+        }
+        // The answer to SetDefault lists all defaults, and may be large.
+        if answer.len() > LARGEST_ANSWER {
             return;
         }
         if self.0.len() == KEPT {
@@ -132,6 +140,19 @@ mod tests {
         assert_eq!(recent.answer(&identity("b", "1", 8)), Ok(None));
         assert_eq!(recent.answer(&identity("a", "", 7)), Ok(None));
         assert!(recent.answer(&identity("a", &"x".repeat(101), 7)).is_err());
+    }
+
+    /// Oracle: the contract: a response is stored for one hour; afterwards the id is free again.
+    #[tokio::test(start_paused = true)]
+    async fn a_response_is_dropped_after_an_hour() {
+        let mut recent = Recent::default();
+        recent.remember(identity("a", "1", 7), vec![42]);
+
+        tokio::time::advance(Duration::from_secs(3_600)).await;
+        assert_eq!(recent.answer(&identity("a", "1", 7)), Ok(Some(&[42][..])));
+        tokio::time::advance(Duration::from_millis(1)).await;
+        assert_eq!(recent.answer(&identity("a", "1", 8)), Ok(None));
+        assert!(recent.0.is_empty());
     }
 
     /// Oracle: the bound: only the caller with the most changes loses responses, its oldest first.

@@ -1,5 +1,6 @@
 //! Fits an adapter to a room on the server.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
@@ -9,13 +10,12 @@ use tonic::Status;
 
 use super::super::auth::RoomScope;
 use super::super::caller::Requester;
-use super::super::snapshot::Snapshot;
 use super::super::workers::{CallContext, Lane};
 use super::super::{Error, Handlers};
 use super::changes::{check_right, identity, named_whole, revision_to_wire};
+use super::quotas::{Quotas, owner};
 use super::recent::Identity;
 use seese3_client::proto::v1 as pb;
-use seese3_core::adapter::EpochProgress;
 use seese3_core::cancel::Cancellation;
 use seese3_robot::fitting::{FITTING_EPOCHS, FitRun};
 use seese3_store::fit_stored_room::{Refit, Request};
@@ -32,18 +32,20 @@ pub struct Admitted {
     request: Request,
     identity: Identity,
     validate_only: bool,
+    quotas: Quotas,
+    /// Whether the adapter's name must be one of the room's.
+    is_scoped: bool,
 }
 
 impl Handlers {
-    /// Validates a request without reading the store.
+    /// Validates a request. Reads the store only if the request names a base adapter.
     ///
     /// # Errors
     /// [`Error::Invalid`], naming the field; [`Error::OutOfScope`] if the caller may not change the
     /// room.
-    pub(super) fn admit_refit(
+    pub(super) async fn admit_refit(
         &self,
         caller: &Requester,
-        snapshot: &Snapshot,
         request: pb::RefitRoomRequest,
     ) -> Result<Admitted, Error> {
         let content = request.encode_to_vec();
@@ -78,18 +80,16 @@ impl Handlers {
         let base = adapter("base_adapter", &base_adapter)?;
         if let Some(base) = &base {
             // A hidden adapter is answered like a missing one.
+            let snapshot = self.reloaded(caller).await?;
             let seen = snapshot.adapter(base);
             seen.map_err(|error| error.named("base_adapter"))?;
         }
 
-        let is_of_room = |name: &String| is_in_namespace(name, &room.name);
         let sees_all = caller.scope().is_none_or(RoomScope::is_all);
-        if !sees_all && !fitted_adapter.as_ref().is_none_or(is_of_room) {
-            let problem = format!(
-                "must be '{}.NAME' or '{}.NAME.NAME' for a caller without access to all rooms",
-                room.name, room.name
-            );
-            return Err(Error::invalid("fitted_adapter", problem));
+        if let Some(name) = &fitted_adapter
+            && !sees_all
+        {
+            self.check_namespace(name, &room.name)?;
         }
 
         let request = Request {
@@ -104,14 +104,38 @@ impl Handlers {
             request,
             identity,
             validate_only,
+            quotas: self.changes()?.quotas(caller),
+            is_scoped: !sees_all,
         })
+    }
+
+    /// Checks that a fitted adapter is named after its room, and not after another room whose name is
+    /// longer.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] if not.
+    fn check_namespace(&self, adapter: &str, room: &str) -> Result<(), Error> {
+        let snapshot = self.snapshot_for(None)?;
+        if owner(adapter, snapshot.rooms().keys()) == Some(room) {
+            return Ok(());
+        }
+        let problem = format!(
+            "must be '{room}.NAME' for a caller without access to all rooms, and must not begin with the name of \
+             another room"
+        );
+        Err(Error::invalid("fitted_adapter", problem))
     }
 
     /// Fits, publishes and sends the result. Stops the fit if the caller disconnects before it is
     /// published.
     pub(super) async fn run_refit(self, admitted: Admitted, context: CallContext, events: Events) {
+        let progress = Arc::new(FitProgress {
+            done: AtomicU32::new(0),
+            events: events.clone(),
+        });
         let result = tokio::select! {
-            result = self.refit(admitted, context, &events) => result,
+            result = self.refit(admitted, context, progress.clone()) => result,
+            () = progress.repeated() => return,
             () = events.closed() => {
                 tracing::info!("the fit was cancelled");
                 return;
@@ -133,12 +157,14 @@ impl Handlers {
         &self,
         admitted: Admitted,
         context: CallContext,
-        events: &Events,
+        progress: Arc<FitProgress>,
     ) -> Result<pb::RefitResult, Error> {
         let Admitted {
             request,
             identity,
             validate_only,
+            quotas,
+            is_scoped,
         } = admitted;
         let changes = self.changes()?.clone();
         if let Some(answer) = changes.answered(&identity).await? {
@@ -156,17 +182,23 @@ impl Handlers {
             ..context
         };
         let room = request.room.clone();
-        let heard = events.clone();
         let store = changes.store.clone();
+        let of_room = room.clone();
+        let handlers = self.clone();
         let runtime = tokio::runtime::Handle::current();
         let fit = move |cancel: &Cancellation| {
+            // Before the work, so that it is not lost.
+            runtime.block_on(quotas.check(&of_room))?;
             // The room is read when the fit's turn has come, so that queued fits hold no memory.
             let refit = runtime.block_on(Refit::prepare(&store, request))?;
+            if is_scoped {
+                handlers.check_namespace(refit.name(), &of_room)?;
+            }
             if validate_only {
                 return Ok((refit, None));
             }
             let fitted = refit.fit(FitRun {
-                progress: &sends_progress(heard),
+                progress: &|_| progress.step(),
                 cancel,
             })?;
             Ok((refit, Some(fitted)))
@@ -195,23 +227,35 @@ impl Handlers {
     }
 }
 
-/// Whether an adapter's name belongs to a room: the room's name and one or two parts. The name that
-/// a fit chooses itself has two. With more, a room `lab` could take a name of the room `lab.b`.
-fn is_in_namespace(adapter: &str, room: &str) -> bool {
-    let rest = adapter.strip_prefix(room);
-    let rest = rest.and_then(|rest| rest.strip_prefix('.'));
-    rest.is_some_and(|rest| rest.split('.').count() <= 2)
+/// Sends a fit's progress. A slow caller misses events; waiting for it would block the fit.
+struct FitProgress {
+    /// Number of finished epochs.
+    done: AtomicU32,
+    events: Events,
 }
 
-/// Sends each epoch's progress. A slow caller misses events; waiting for it would block the fit.
-fn sends_progress(events: Events) -> impl Fn(EpochProgress) + Sync {
-    let done = AtomicU32::new(0);
-    move |_| {
+impl FitProgress {
+    /// Counts and sends an epoch.
+    fn step(&self) {
+        self.done.fetch_add(1, Ordering::Relaxed);
+        self.send();
+    }
+
+    /// Sends the progress every second, also while the fit waits for its turn, so that the caller can
+    /// tell a waiting fit from a broken connection. Never completes.
+    async fn repeated(&self) {
+        loop {
+            tokio::time::sleep(Duration::from_secs(1)).await;
+            self.send();
+        }
+    }
+
+    fn send(&self) {
         let progress = pb::RefitProgress {
-            done: done.fetch_add(1, Ordering::Relaxed) + 1,
+            done: self.done.load(Ordering::Relaxed),
             total: FITTING_EPOCHS as u32,
         };
         let event = Some(pb::refit_room_response::Event::Progress(progress));
-        let _ = events.try_send(Ok(pb::RefitRoomResponse { event }));
+        let _ = self.events.try_send(Ok(pb::RefitRoomResponse { event }));
     }
 }

@@ -14,9 +14,7 @@ use super::super::shares::Share;
 use super::super::snapshot::Snapshot;
 use super::super::workers::Lane;
 use super::super::{Error, Handlers, convert};
-use super::changes::{
-    check_length, check_right, identity, named_whole, on_blocking_thread, revision_to_wire,
-};
+use super::changes::{Changes, check_length, check_right, identity, named_whole, revision_to_wire};
 use super::keypoints_upload::ReceivedKeypoints;
 use seese3_client::proto::v1 as pb;
 use seese3_core::features::{FeatureSource, Features, MAX_COLUMNS, UNSPECIFIED};
@@ -86,6 +84,18 @@ struct Received {
     caller: CallerId,
 }
 
+impl Changes {
+    /// Reserves memory for extending a room: the existing room and the added frames are joined in
+    /// memory.
+    async fn extension_memory(&self, caller: &CallerId, room: &str) -> Result<Share, Error> {
+        let known = self.store.newest_room_summary(room).await?;
+        let columns: usize = known.features.iter().map(|source| source.dim).sum();
+        let keypoints = known.keypoints.map_or(0, |_| KEYPOINT_BYTES);
+        let bytes = known.frame_count * (POSE_BYTES + 4 * columns + keypoints);
+        self.upload_memory(caller, 2 * bytes)
+    }
+}
+
 impl Handlers {
     /// Receives a room, checks it and, unless `validate_only`, publishes it or extends the stored
     /// room.
@@ -104,17 +114,8 @@ impl Handlers {
         };
         let mut received = begun(&upload, &caller, &snapshot)?;
         if upload.extend {
-            // The existing room and the added frames are joined in memory.
-            let known = changes
-                .store
-                .newest_room_summary(&received.name.name)
-                .await?;
-            let columns: usize = known.features.iter().map(|source| source.dim).sum();
-            let keypoints = known.keypoints.map_or(0, |_| KEYPOINT_BYTES);
-            let bytes = known.frame_count * (POSE_BYTES + 4 * columns + keypoints);
-            received
-                .memory
-                .push(changes.upload_memory(&caller.id, 2 * bytes)?);
+            let memory = changes.extension_memory(&caller.id, &received.name.name);
+            received.memory.push(memory.await?);
         }
 
         let end = self
@@ -142,16 +143,22 @@ impl Handlers {
         let store = changes.store.clone();
         if upload.validate_only {
             if upload.extend {
-                let check = async move { store.extended_room(uploaded.contents(), others).await };
-                on_blocking_thread(check).await??;
+                let check = async move {
+                    let extended = store.extended_room(uploaded.contents(), others).await;
+                    Ok(extended.map(drop)?)
+                };
+                changes.validated(&caller.id, check).await?;
             }
             return Ok(pb::CreateRoomResponse::default());
         }
 
         let extend = upload.extend;
+        let quotas = changes.quotas(&caller);
+        let room = name.clone();
         let change = async move {
             // Uploaded data counts toward the limit until it is stored.
             let _memory = memory;
+            quotas.check(&room).await?;
             let published = if extend {
                 store.extend_room(uploaded.contents(), others).await
             } else {

@@ -16,7 +16,7 @@ use tower::{Layer, Service};
 use super::super::Error;
 use super::super::caller::CallerId;
 use super::super::connections::Peer;
-use super::super::health::{HEALTH_CHECK, HEALTH_WATCH};
+use super::super::health::{HEALTH_BYTES, HEALTH_CHECK, HEALTH_WATCH};
 use super::super::holding_body::holding;
 use super::super::rpcs::rpc;
 use super::super::status::Full;
@@ -27,8 +27,6 @@ use super::{MEMORY_LEASE, Memory, MemoryLease};
 
 /// Time limit for receiving a health request. It needs no credentials, and is a few bytes.
 const HEALTH_RECEIVE: Duration = Duration::from_secs(1);
-/// Maximum size of a health request, bytes: the name of a service or room.
-const HEALTH_BYTES: usize = 1 << 10;
 
 /// Middleware that bounds the memory held by requests.
 #[derive(Debug, Clone)]

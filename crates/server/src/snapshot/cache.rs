@@ -7,6 +7,7 @@ use moka::policy::EvictionPolicy;
 use moka::sync::Cache;
 use tokio::runtime::Handle;
 
+use super::super::slow_files::logged_if_slow;
 use super::Refusal;
 use super::loaded::LoadedRoom;
 use super::room_loading::{RoomLoader, RoomToLoad, contained};
@@ -75,7 +76,8 @@ impl RoomCache {
     /// Loads a room. A panic is returned as a refusal.
     pub(super) async fn load(&self, room: RoomToLoad<'_>) -> Result<LoadedRoom, Refusal> {
         let revision = room.revision;
-        let loaded = contained(self.loader.load(room)).await;
+        let what = format!("room '{}'", room.id);
+        let loaded = logged_if_slow(&what, contained(self.loader.load(room))).await;
         loaded.map_err(|problem| Refusal::new(revision, &problem))
     }
 

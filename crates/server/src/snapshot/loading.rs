@@ -174,6 +174,7 @@ impl Loader {
         refused: Refused,
     ) -> Result<Snapshot, RunError> {
         let mut loaded = Snapshot {
+            decoding: self.decoding.clone(),
             ..Snapshot::default()
         };
 

@@ -19,6 +19,7 @@ use std::sync::Arc;
 
 use super::Error;
 use super::auth::RoomScope;
+use super::decoding::DecodingMemory;
 use super::image_encoder::ImageEncoder;
 use super::metrics::ServedCounts;
 use seese3_core::keypoints::KeypointSource;
@@ -75,10 +76,17 @@ pub struct Snapshot {
     image_encoders: BTreeMap<String, Arc<ImageEncoder>>,
     /// Encoders of the rooms' keypoints.
     keypoint_encoders: KeypointEncoders,
+    /// Memory for decoding images, shared with the encoders.
+    decoding: Arc<DecodingMemory>,
     refused: Refusals,
 }
 
 impl Snapshot {
+    /// Memory for decoding images.
+    pub fn decoding(&self) -> &DecodingMemory {
+        &self.decoding
+    }
+
     /// Refusals found when this snapshot was made. An older revision may be served instead.
     pub fn refused(&self) -> &Refusals {
         &self.refused
@@ -101,6 +109,7 @@ impl Snapshot {
             adapters: owned(self.adapters.iter().filter(is_seen)),
             image_encoders: self.image_encoders.clone(),
             keypoint_encoders: self.keypoint_encoders.clone(),
+            decoding: self.decoding.clone(),
             refused: Refusals {
                 rooms: owned(refused_rooms.filter(|(name, _)| scope.contains(name))),
                 // An adapter may be named after its room.

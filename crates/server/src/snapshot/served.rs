@@ -5,6 +5,8 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::super::Error;
+use super::super::status::Full;
+use super::super::workers::off_the_lane;
 use super::cache::{Key, RoomCache};
 use super::loaded::{Candidate, LoadedRoom};
 use super::room_loading::RoomToLoad;
@@ -92,13 +94,22 @@ impl ServedRoom {
     /// block.
     ///
     /// # Errors
-    /// [`Error::Precondition`] if the room cannot be loaded. The log says why.
+    /// [`Error::Precondition`] if the room cannot be loaded; the log says why. [`Error::Full`] if too
+    /// many requests wait for the disk.
     pub fn load(&self) -> Result<Arc<LoadedRoom>, Error> {
         // Damaged files are not read again; unreadable ones are retried.
         let refused = self.refusal().filter(|refusal| !refusal.may_pass);
         let loaded = match refused {
             Some(refusal) => Err(refusal),
-            None => self.get_or_load(),
+            None => match self.cache.get(self.key) {
+                Some(room) => Ok(room),
+                // Other rooms are answered meanwhile: the store may not answer.
+                None => {
+                    let loaded = off_the_lane(|| self.get_or_load());
+                    let what = Full::DiskReads;
+                    loaded.map_err(|_| Error::Full { what })?
+                }
+            },
         };
 
         loaded.map_err(|refusal| refused_error("room", self.id.as_str(), &refusal))

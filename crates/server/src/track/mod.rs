@@ -31,7 +31,8 @@ use tracing::Instrument;
 use super::auth::{Keyring, Principal};
 use super::caller::CallerId;
 use super::memory::StreamMemory;
-use super::shares::Share;
+use super::shares::{Exhausted, Share};
+
 use super::status::Full;
 use super::workers::{CallContext, Lane};
 use super::{Error, Handlers, Phase, principal};
@@ -66,6 +67,17 @@ pub struct Overtaken {
 }
 
 impl Handlers {
+    /// A place among the open streams.
+    fn stream_place(&self, caller: &CallerId) -> Result<Share, Error> {
+        let place = self.streams.take(caller.clone(), 1);
+        place.map_err(|limit| {
+            self.workers.full(match limit {
+                Exhausted::Budget => Full::Streams,
+                Exhausted::Share => Full::CallersStreams,
+            })
+        })
+    }
+
     /// Opens a stream and answers its messages until the caller ends it, an error occurs, or the
     /// server stops.
     ///
@@ -107,11 +119,7 @@ impl Handlers {
 
         // The stream holds this permit while it is open. It bounds the number of streams, whose
         // frames are never refused for a full queue.
-        let place = self
-            .streams
-            .clone()
-            .try_acquire_owned()
-            .map_err(|_| self.workers.full(Full::Streams))?;
+        let place = self.stream_place(&context.caller)?;
 
         let callers_place = match &caller {
             None => None,

@@ -15,6 +15,9 @@ use std::time::Duration;
 
 use super::super::caller::CallerId;
 
+/// Number of paused jobs of a caller from which on it begins no new ones. Each keeps a thread of the
+/// operating system.
+const MOST_PAUSED_OF_CALLER: usize = 4;
 /// Number of idle callers that are kept before the queue removes those without debt.
 const MOST_IDLE: usize = 64;
 
@@ -24,6 +27,9 @@ pub enum Urgency {
     /// A frame of an open stream: before the caller's requests.
     Frame,
     Request,
+    /// A request that has begun: after the others, so that they get turns too, until the caller has
+    /// several of this kind.
+    Paused,
 }
 
 /// Waiting jobs of type `T` and the worker time that their callers have used.
@@ -47,6 +53,8 @@ struct Account<T> {
     running: usize,
     frames: VecDeque<T>,
     requests: VecDeque<T>,
+    /// Jobs that have begun and were paused.
+    paused: VecDeque<T>,
 }
 
 impl<T> Account<T> {
@@ -57,11 +65,25 @@ impl<T> Account<T> {
             running: 0,
             frames: VecDeque::new(),
             requests: VecDeque::new(),
+            paused: VecDeque::new(),
         }
     }
 
     fn waits(&self) -> bool {
-        !self.frames.is_empty() || !self.requests.is_empty()
+        !self.frames.is_empty() || !self.requests.is_empty() || !self.paused.is_empty()
+    }
+
+    /// The next job: a frame, then a new request, unless too many are paused already.
+    fn next(&mut self) -> Option<T> {
+        if let Some(frame) = self.frames.pop_front() {
+            return Some(frame);
+        }
+        if self.paused.len() < MOST_PAUSED_OF_CALLER
+            && let Some(request) = self.requests.pop_front()
+        {
+            return Some(request);
+        }
+        self.paused.pop_front()
     }
 
     fn is_idle(&self) -> bool {
@@ -93,6 +115,7 @@ impl<T> FairQueue<T> {
         match urgency {
             Urgency::Frame => account.frames.push_back(job),
             Urgency::Request => account.requests.push_back(job),
+            Urgency::Paused => account.paused.push_back(job),
         }
 
         let used = account.used;
@@ -105,8 +128,7 @@ impl<T> FairQueue<T> {
     pub fn pop(&mut self) -> Option<(CallerId, T, Duration)> {
         let (_, caller) = self.order.pop_first()?;
         let account = self.accounts.get_mut(&caller)?;
-        let job = account.frames.pop_front();
-        let job = job.or_else(|| account.requests.pop_front())?;
+        let job = account.next()?;
         account.running += 1;
 
         let charged = self.started(&caller);
@@ -158,6 +180,7 @@ impl<T> FairQueue<T> {
         let was_waiting = account.waits();
         account.frames.retain(|job| !is_job(job));
         account.requests.retain(|job| !is_job(job));
+        account.paused.retain(|job| !is_job(job));
         if was_waiting && !account.waits() {
             self.order.remove(&(account.used, caller.clone()));
             self.active -= u32::from(account.is_idle());
@@ -283,6 +306,24 @@ mod tests {
         let order: Vec<&str> = std::iter::from_fn(|| Some(queue.pop()?.1)).collect();
         assert_eq!(order, ["first frame", "second frame", "request"]);
         assert!(queue.is_empty());
+    }
+
+    /// Oracle: the contract, by hand: a caller begins new requests while fewer than four are paused.
+    #[test]
+    fn a_caller_pauses_few_requests() {
+        let mut queue = FairQueue::default();
+        for job in ["fifth", "sixth"] {
+            queue.push(&caller(1), Urgency::Request, job);
+        }
+        for job in ["first", "second", "third", "fourth"] {
+            queue.push(&caller(1), Urgency::Paused, job);
+        }
+
+        let order: Vec<&str> = std::iter::from_fn(|| Some(queue.pop()?.1)).collect();
+        assert_eq!(
+            order,
+            ["first", "fifth", "sixth", "second", "third", "fourth"]
+        );
     }
 
     /// Oracle: the definition of a fair share: one caller that always waits gets a quarter of the

@@ -26,6 +26,7 @@ use super::shares::Exhausted;
 use super::status::Full;
 use super::{Config, Error};
 use fair_queue::Urgency;
+pub use pool::off_the_lane;
 use pool::{Pool, pause_if_others_wait};
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
@@ -397,6 +398,47 @@ mod tests {
         assert!(!first.is_finished());
         release.send(()).unwrap();
         assert_eq!(first.await.unwrap(), Ok(1));
+    }
+
+    /// Oracle: the contract, and the rule of the shares by hand: jobs that wait for the disk hold no thread
+    /// of the lane; of 64 places one caller gets 32; each goes on when the disk answers.
+    #[tokio::test]
+    async fn jobs_that_wait_for_the_disk_hold_no_thread() {
+        let workers = workers(1, 8);
+        let (answers, answer) = tokio::sync::watch::channel(false);
+        let (waits, mut waiting_now) = tokio::sync::mpsc::unbounded_channel();
+        let hung = |caller| {
+            let (workers, mut answer) = (workers.clone(), answer.clone());
+            let waits = waits.clone();
+            tokio::spawn(async move {
+                let context = context(caller, Duration::from_secs(30));
+                let runtime = tokio::runtime::Handle::current();
+                let work = move |_: &Cancellation| {
+                    let waited = off_the_lane(|| {
+                        let _ = waits.send(());
+                        runtime.block_on(answer.wait_for(|is| *is)).is_ok()
+                    });
+                    waited.map_err(|_| Error::Internal)
+                };
+                workers.run(Lane::Short, context, work).await
+            })
+        };
+
+        let mut waiting = Vec::new();
+        for _ in 0..32 {
+            waiting.push(hung(1));
+            waiting_now.recv().await.unwrap();
+            let other = context(2, Duration::from_secs(30));
+            assert_eq!(workers.run(Lane::Short, other, |_| Ok(2)).await, Ok(2));
+        }
+        assert_eq!(hung(1).await.unwrap(), Err(Error::Internal));
+
+        answers.send(true).unwrap();
+        for job in waiting {
+            assert_eq!(job.await.unwrap(), Ok(true));
+        }
+        let last = context(1, Duration::from_secs(30));
+        assert_eq!(workers.run(Lane::Short, last, |_| Ok(3)).await, Ok(3));
     }
 
     /// Oracle: by hand from the rule of the shares: of four places one caller gets two, another

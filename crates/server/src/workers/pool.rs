@@ -12,8 +12,10 @@ use super::fair_queue::{FairQueue, Urgency};
 
 /// Time slice of a job while other jobs wait.
 const SLICE: Duration = Duration::from_millis(10);
+/// Maximum number of jobs of a lane that wait for something else than a thread.
+const MOST_OFF: usize = 64;
 /// Maximum number of paused jobs of a lane. Each keeps a thread of the operating system.
-const MOST_PAUSED: usize = 64;
+const MOST_PAUSED: usize = 256;
 
 thread_local! {
     /// The turn of the job that runs on this thread.
@@ -26,6 +28,8 @@ pub struct Pool {
     state: Arc<Mutex<State>>,
     /// Places in the queue for requests, divided between callers. Frames of streams need none.
     places: Arc<Shares>,
+    /// Places for jobs that wait for something else than a thread, divided between callers.
+    off: Arc<Shares>,
 }
 
 #[derive(Debug)]
@@ -40,7 +44,6 @@ struct State {
 #[derive(Debug)]
 struct Waiting {
     ticket: u64,
-    urgency: Urgency,
     granted: oneshot::Sender<Turn>,
 }
 
@@ -49,7 +52,6 @@ struct Waiting {
 pub struct Turn {
     pool: Pool,
     caller: CallerId,
-    urgency: Urgency,
     began: Instant,
     charged: Duration,
     /// Whether the thread was passed on already.
@@ -83,6 +85,7 @@ impl Pool {
                 last_ticket: 0,
             })),
             places: Shares::new(places),
+            off: Shares::new(MOST_OFF),
         }
     }
 
@@ -97,7 +100,7 @@ impl Pool {
             if state.free > 0 {
                 state.free -= 1;
                 let charged = state.waiting.start(caller);
-                return Ok(self.begin(caller.clone(), urgency, charged));
+                return Ok(self.begin(caller.clone(), charged));
             }
 
             let place = self.place(caller, urgency)?;
@@ -113,18 +116,35 @@ impl Pool {
         turn.await.map_err(|_| Exhausted::Budget)
     }
 
+    /// Waits for a thread, for a job that has had one before. Blocks.
+    fn next_turn(&self, caller: CallerId) -> Turn {
+        let (granted, turn) = oneshot::channel();
+        let mut state = self.lock();
+        if state.free > 0 {
+            state.free -= 1;
+            let charged = state.waiting.start(&caller);
+            return self.begin(caller, charged);
+        }
+        state.wait(&caller, Urgency::Paused, granted);
+        drop(state);
+
+        // The sender is in the queue of this pool until it sends.
+        let mut over = self.begin(caller, Duration::ZERO);
+        over.is_over = true;
+        turn.blocking_recv().unwrap_or(over)
+    }
+
     fn place(&self, caller: &CallerId, urgency: Urgency) -> Result<Option<Share>, Exhausted> {
         match urgency {
             Urgency::Frame => Ok(None),
-            Urgency::Request => self.places.take(caller.clone(), 1).map(Some),
+            Urgency::Request | Urgency::Paused => self.places.take(caller.clone(), 1).map(Some),
         }
     }
 
-    fn begin(&self, caller: CallerId, urgency: Urgency, charged: Duration) -> Turn {
+    fn begin(&self, caller: CallerId, charged: Duration) -> Turn {
         Turn {
             pool: self.clone(),
             caller,
-            urgency,
             began: Instant::now(),
             charged,
             is_over: false,
@@ -138,7 +158,7 @@ impl Pool {
     /// Passes a thread to the next job that is still wanted.
     fn pass_on(&self, state: &mut State) {
         while let Some((caller, waiting, charged)) = state.waiting.pop() {
-            let turn = self.begin(caller, waiting.urgency, charged);
+            let turn = self.begin(caller, charged);
             match waiting.granted.send(turn) {
                 Ok(()) => return,
                 Err(mut unwanted) => {
@@ -158,11 +178,7 @@ impl State {
     fn wait(&mut self, caller: &CallerId, urgency: Urgency, granted: oneshot::Sender<Turn>) -> u64 {
         self.last_ticket += 1;
         let ticket = self.last_ticket;
-        let waiting = Waiting {
-            ticket,
-            urgency,
-            granted,
-        };
+        let waiting = Waiting { ticket, granted };
         self.waiting.push(caller, urgency, waiting);
         ticket
     }
@@ -198,11 +214,10 @@ impl Turn {
             return self;
         }
 
-        // The job is queued behind the others of its caller, so that they get turns too.
         let (granted, turn) = oneshot::channel();
         self.is_over = true;
         state.waiting.end(&self.caller, elapsed, self.charged);
-        state.wait(&self.caller, self.urgency, granted);
+        state.wait(&self.caller, Urgency::Paused, granted);
         state.paused += 1;
         pool.pass_on(&mut state);
         drop(state);
@@ -212,6 +227,31 @@ impl Turn {
         // The sender is in the queue of `pool` until it sends.
         turn.unwrap_or(self)
     }
+}
+
+/// Runs work that waits for something else than a thread, such as the disk, while the lane's thread
+/// serves other jobs. Blocks the thread of the operating system. On other threads it only runs the work.
+///
+/// # Errors
+/// The limit of waiting jobs that is reached.
+pub fn off_the_lane<T>(work: impl FnOnce() -> T) -> Result<T, Exhausted> {
+    let Some(turn) = TURN.take() else {
+        return Ok(work());
+    };
+    let (pool, caller) = (turn.pool.clone(), turn.caller.clone());
+    let place = match pool.off.take(caller.clone(), 1) {
+        Ok(place) => place,
+        Err(limit) => {
+            TURN.set(Some(turn));
+            return Err(limit);
+        }
+    };
+    drop(turn);
+
+    let result = work();
+    drop(place);
+    TURN.set(Some(pool.next_turn(caller)));
+    Ok(result)
 }
 
 impl Drop for Turn {

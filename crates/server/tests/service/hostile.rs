@@ -194,7 +194,8 @@ async fn idle_streams_hold_nobody_up() {
         text.parse().expect("SEESE3_IDLE_STREAMS is a number")
     });
     let server = start_followed(Config {
-        streams: count,
+        // One connection gets half of them.
+        streams: 2 * count,
         ..Config::default()
     })
     .await;

@@ -17,6 +17,7 @@ mod harness;
 mod hostile;
 mod http2;
 mod images;
+mod isolation;
 mod keypoints_upload;
 mod lifecycle;
 mod memory;

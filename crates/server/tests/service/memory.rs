@@ -3,14 +3,18 @@
 
 use std::time::Duration;
 
+use pb::track_response::Answer;
 use prost::Message;
 use seese3_client::proto::v1 as pb;
 use seese3_server::{Config, Metrics};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio_stream::wrappers::ReceiverStream;
 use tonic::Code;
 
-use crate::harness::{StoppedClock, metric, question, soon, start, until};
+use crate::harness::{StoppedClock, feature, metric, question, soon, start, until};
 use crate::http2::{NAVIGATE, frame, headers, opened, prefixed, silent_calls};
+use crate::isolation;
+use crate::security::{client_with, principal};
 
 /// Waits until as many bytes are held as wanted, as the metrics say.
 async fn until_held(metrics: &Metrics, is_wanted: impl Fn(u64) -> bool) {
@@ -161,6 +165,116 @@ async fn a_second_message_is_not_decoded() {
     until_held(&metrics, |held| held == 0).await;
     let refused = r#"method="/seese3.v1.NavigationService/Navigate",code="INVALID_ARGUMENT"} 1"#;
     assert!(metrics.text().contains(refused), "{}", metrics.text());
+}
+
+/// Oracle: the contract: a message of a stream is counted while it is worked on, not until the stream
+/// ends. A refused frame of 1 MB leaves what an idle stream holds.
+#[tokio::test]
+async fn an_idle_stream_holds_nothing_of_its_messages() {
+    let metrics = Metrics::default();
+    let config = Config {
+        metrics: metrics.clone(),
+        ..Config::default()
+    };
+    let robot = principal("robot", "\"track\"", "\"*\"");
+    let server = isolation::server(config, &robot).await;
+    let client = client_with(&server, Some("robot")).await;
+
+    let (requests, open) = tokio::sync::mpsc::channel(4);
+    let config = pb::TrackConfig {
+        room: "lab".to_owned(),
+        ..pb::TrackConfig::default()
+    };
+    let large = pb::TrackFrame {
+        sequence: 1,
+        timestamp_ns: 1,
+        view: feature(vec![0.0; 250_000]),
+        ..pb::TrackFrame::default()
+    };
+    for message in [
+        pb::track_request::Message::Config(config),
+        pb::track_request::Message::Frame(large),
+    ] {
+        let message = Some(message);
+        requests.send(pb::TrackRequest { message }).await.unwrap();
+    }
+    let mut answers = client.track(ReceiverStream::new(open)).await.unwrap();
+    let started = answers.message().await.unwrap().unwrap();
+    assert!(matches!(started.answer, Some(Answer::Started(_))));
+    let refused = answers.message().await.unwrap().unwrap();
+    assert!(
+        matches!(refused.answer, Some(Answer::Refusal(_))),
+        "of another length"
+    );
+
+    until_held(&metrics, |held| held <= 64 << 10).await;
+    assert!(!requests.is_closed(), "the stream is open");
+}
+
+/// Oracle: the bounds by hand: eight health calls of a connection, each of one second. Other
+/// connections are answered, and a path that is no RPC holds nothing.
+#[tokio::test]
+async fn health_calls_without_a_body_hold_up_nobody() {
+    let clock = StoppedClock::new();
+    let metrics = Metrics::default();
+    let server = start(Config {
+        memory_bytes: 2 << 20,
+        metrics: metrics.clone(),
+        ..Config::default()
+    })
+    .await;
+
+    for path in [
+        "/grpc.health.v1.Health/Check",
+        "/grpc.health.v1.Health/Nope",
+    ] {
+        let mut silent = Vec::new();
+        for _ in 0..8 {
+            let mut stream = opened(&server.address, &[]).await;
+            for call in 0..200 {
+                let call = frame(1, 4, 2 * call + 1, &headers(path));
+                stream.write_all(&call).await.unwrap();
+            }
+            silent.push(stream);
+        }
+
+        for _ in 0..20 {
+            assert!(server.client.serves("").await.unwrap());
+            assert!(server.client.navigate(question()).await.is_ok());
+        }
+        let held = metric(&metrics, "seese3_memory_held_bytes").unwrap();
+        assert!(held < f64::from(64 << 10), "{path}: {held}");
+
+        // Each connection had eight calls, and now they have ended.
+        if path.ends_with("Check") {
+            let counted = |code: &str| {
+                let name =
+                    format!(r#"seese3_request_seconds_count{{method="{path}",code="{code}"}}"#);
+                metric(&metrics, &name).unwrap_or(0.0)
+            };
+            let full = async || counted("RESOURCE_EXHAUSTED");
+            until("192 of 200 are refused", full, |count| {
+                *count == 8.0 * 192.0
+            })
+            .await;
+            clock.advance(Duration::from_secs(1)).await;
+            let late = async || counted("DEADLINE_EXCEEDED");
+            until("the others are late", late, |count| *count == 8.0 * 8.0).await;
+        }
+        drop(silent);
+    }
+}
+
+/// Oracle: the bound of 1 KiB itself.
+#[tokio::test]
+async fn a_large_health_check_is_refused() {
+    let server = start(Config::default()).await;
+    let check = async |bytes: usize| {
+        let answer = server.client.serves(&"x".repeat(bytes)).await;
+        answer.unwrap_err().code()
+    };
+    assert_eq!(check(1_000).await, Some(Code::NotFound));
+    assert_eq!(check(1_100).await, Some(Code::OutOfRange));
 }
 
 /// Oracle: by hand: two bytes for each name of a room are a string when they are decoded.

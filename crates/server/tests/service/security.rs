@@ -11,12 +11,15 @@ use seese3_server::{Config, Keyring, Tls, TlsFiles};
 use sha2::{Digest, Sha256};
 use tokio::io::AsyncReadExt;
 use tokio::net::TcpStream;
+use tokio_stream::wrappers::ReceiverStream;
 use tonic::Code;
 
 use crate::harness::{
     PATIENCE, StoppedClock, TestServer, code_of, filled_store, frame, question, soon, start,
     start_on, to_frame, until,
 };
+use crate::http2::opened;
+use crate::isolation;
 
 const VERBS: [&str; 6] = [
     "navigate", "localize", "track", "evaluate", "catalog", "write",
@@ -431,6 +434,66 @@ async fn a_certificate_is_needed_and_says_who_is_calling() {
         Ok(client) => client.navigate(question()).await.is_err(),
         Err(_) => true,
     });
+}
+
+/// Oracle: the contract: who has no credential cannot keep others out by holding connections, neither
+/// silent ones nor open ones, and does not end those of others.
+#[tokio::test]
+async fn connections_without_credentials_make_room() {
+    let config = Config {
+        connections: 4,
+        ..Config::default()
+    };
+    let robots = ["first", "second", "third"];
+    let robots = robots.map(|name| principal(name, "\"navigate\", \"track\"", "\"*\""));
+    let server = isolation::server(config, &robots.concat()).await;
+    let question = || pb::NavigateRequest {
+        room: "lab".to_owned(),
+        source: frame(3),
+        displacement: to_frame(5),
+        ..pb::NavigateRequest::default()
+    };
+
+    let first = client_with(&server, Some("first")).await;
+    assert!(first.navigate(question()).await.is_ok());
+    let (requests, open) = tokio::sync::mpsc::channel(1);
+    let tracked = client_with(&server, Some("second")).await;
+    let config = pb::TrackConfig {
+        room: "lab".to_owned(),
+        ..pb::TrackConfig::default()
+    };
+    let message = Some(pb::track_request::Message::Config(config));
+    requests.send(pb::TrackRequest { message }).await.unwrap();
+    let mut stream = tracked.track(ReceiverStream::new(open)).await.unwrap();
+    stream.message().await.unwrap().unwrap();
+
+    let mut held = Vec::new();
+    for number in 0..20 {
+        held.push(if number % 2 == 0 {
+            TcpStream::connect(&server.address).await.unwrap()
+        } else {
+            opened(&server.address, &[]).await
+        });
+    }
+    let other = client_with(&server, Some("third")).await;
+    assert!(other.navigate(question()).await.is_ok());
+
+    let mut ended = 0;
+    for connection in &mut held {
+        let mut heard = Vec::new();
+        let read = tokio::time::timeout(
+            Duration::from_millis(50),
+            connection.read_to_end(&mut heard),
+        );
+        ended += usize::from(read.await.is_ok());
+    }
+    assert!(
+        ended >= 18,
+        "{ended} of 20 were closed for the places of two, and then of one"
+    );
+
+    let still_open = tokio::time::timeout(Duration::from_millis(50), stream.message());
+    assert!(still_open.await.is_err(), "the stream goes on");
 }
 
 /// Oracle: the bounds themselves: connections beyond the limit are closed at once, and those that

@@ -1,9 +1,15 @@
 //! Accepts connections, with a limit on their number and on the time to open one.
 //!
+//! | file | what |
+//! | --- | --- |
+//! | `unauthenticated` | connections that are closed for others at the limit |
+//!
 //! tonic accepts any number of connections and keeps those that never send a byte. Here each
 //! accepted connection takes a permit. Within a time limit it must finish the TLS handshake and
 //! send as many bytes as the HTTP/2 preface has. Only then is it passed to tonic, which checks the
 //! bytes.
+
+mod unauthenticated;
 
 use std::future::Future;
 use std::io;
@@ -28,6 +34,7 @@ use tonic::transport::server::Connected;
 use super::metrics::Metrics;
 use super::status::Full;
 use super::tls::Tls;
+use unauthenticated::{Entry, Unauthenticated};
 
 /// Length of the HTTP/2 connection preface (RFC 9113, section 3.4), bytes.
 const PREFACE: usize = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".len();
@@ -50,6 +57,8 @@ pub struct Peer {
     /// Places of the connection's health calls.
     health: Arc<Semaphore>,
     closing: Arc<Closing>,
+    /// Its place among the connections that may be closed for others.
+    entry: Arc<Entry>,
 }
 
 /// The close signal of a connection.
@@ -68,8 +77,25 @@ impl Peer {
 
     /// Closes the connection and all its streams. Returns true on the first call only.
     pub fn close(&self) -> bool {
-        self.closing.now.notify_one();
-        !self.closing.asked.swap(true, Ordering::Relaxed)
+        self.closing.close()
+    }
+
+    /// Notes that a call of this connection was authenticated.
+    pub fn authenticated(&self) {
+        self.entry.remove();
+    }
+}
+
+impl Closing {
+    /// Asks for the connection to be closed. Returns true on the first call only.
+    fn close(&self) -> bool {
+        self.now.notify_one();
+        !self.asked.swap(true, Ordering::Relaxed)
+    }
+
+    #[cfg(test)]
+    fn is_asked(&self) -> bool {
+        self.asked.load(Ordering::Relaxed)
     }
 }
 
@@ -94,21 +120,43 @@ enum Transport {
 struct Opener {
     places: Arc<Semaphore>,
     last_id: Arc<AtomicU64>,
+    /// Connections that may be closed for others; none on a server without credentials.
+    unauthenticated: Arc<Unauthenticated>,
+    has_credentials: bool,
     tls: Option<Arc<Tls>>,
     metrics: Metrics,
 }
 
-/// Stream of the connections that `listener` accepts, at most `most` at a time; further ones are
-/// closed at once. Dropping the stream drops the listener and the connections being opened.
+/// How connections are accepted.
+pub struct Acceptance {
+    /// Maximum number of connections.
+    pub most: usize,
+    /// Whether calls are authenticated. Then the oldest connection without an authenticated call is
+    /// closed for a new one at the limit; otherwise the new one is closed at once.
+    pub has_credentials: bool,
+    /// The certificate; `None` for plain text.
+    pub tls: Option<Arc<Tls>>,
+    /// Counts closed connections.
+    pub metrics: Metrics,
+}
+
+/// Stream of the connections that `listener` accepts. Dropping the stream drops the listener and the
+/// connections being opened.
 pub fn incoming(
     listener: TcpListener,
-    most: usize,
-    tls: Option<Arc<Tls>>,
-    metrics: Metrics,
+    acceptance: Acceptance,
 ) -> impl Stream<Item = io::Result<Connection>> {
+    let Acceptance {
+        most,
+        has_credentials,
+        tls,
+        metrics,
+    } = acceptance;
     let opener = Opener {
         places: Arc::new(Semaphore::new(most)),
         last_id: Arc::default(),
+        unauthenticated: Arc::default(),
+        has_credentials,
         tls,
         metrics,
     };
@@ -149,20 +197,39 @@ async fn accept_all(
         };
         is_refused = false;
 
-        let Ok(place) = opener.places.clone().try_acquire_owned() else {
+        let place = opener.places.clone().try_acquire_owned().ok();
+        if place.is_none() {
             opener.metrics.shed(Full::Connections);
             if !is_full {
-                tracing::warn!("connection limit reached; further connections are closed at once");
+                tracing::warn!(
+                    "connection limit reached; for each further connection, the oldest without credentials is \
+                     closed, or the new one"
+                );
             }
-            is_full = true;
-            continue;
-        };
-        is_full = false;
+            if !opener.unauthenticated.close_oldest() {
+                is_full = true;
+                continue;
+            }
+        }
+        is_full = place.is_none();
 
+        let peer = opener.peer(address);
         let opener = opener.clone();
         let opened = opened.clone();
         opening.spawn(async move {
-            match tokio::time::timeout(OPENING, opener.open(tcp, address, place)).await {
+            let closing = peer.closing.clone();
+            let connection = async {
+                let place = match place {
+                    Some(place) => place,
+                    None => opener.freed_place().await?,
+                };
+                opener.open(tcp, peer, place).await
+            };
+            let connection = tokio::select! {
+                connection = tokio::time::timeout(OPENING, connection) => connection,
+                () = closing.now.notified() => return,
+            };
+            match connection {
                 // `send` fails if the server is stopping.
                 Ok(Ok(connection)) => drop(opened.send(Ok(connection)).await),
                 Ok(Err(error)) => tracing::debug!(%address, %error, "opening a connection failed"),
@@ -173,24 +240,51 @@ async fn accept_all(
 }
 
 impl Opener {
+    /// A new connection, without a certificate yet.
+    fn peer(&self, address: SocketAddr) -> Peer {
+        let id = self.last_id.fetch_add(1, Ordering::Relaxed);
+        let closing = Arc::<Closing>::default();
+        let entry = self.unauthenticated.add(id, closing.clone());
+        if !self.has_credentials {
+            entry.remove();
+        }
+
+        Peer {
+            id,
+            address,
+            certificate: None,
+            health: Arc::new(Semaphore::new(MOST_HEALTH_CALLS)),
+            closing,
+            entry: Arc::new(entry),
+        }
+    }
+
+    /// The place of a connection that is being closed.
+    async fn freed_place(&self) -> io::Result<OwnedSemaphorePermit> {
+        let place = self.places.clone().acquire_owned().await;
+        place.map_err(io::Error::other)
+    }
+
     /// Performs the TLS handshake, if any, and reads the preface.
     async fn open(
         &self,
         tcp: TcpStream,
-        address: SocketAddr,
+        mut peer: Peer,
         place: OwnedSemaphorePermit,
     ) -> io::Result<Connection> {
         tcp.set_nodelay(true)?;
 
-        let mut certificate = None;
         let mut transport = match &self.tls {
             None => Transport::Plain(tcp),
             Some(tls) => {
                 let stream = tls.acceptor().accept(tcp).await?;
                 let chain = stream.get_ref().1.peer_certificates();
-                certificate = chain
+                peer.certificate = chain
                     .and_then(|chain| chain.first())
                     .map(|first| Sha256::digest(first).into());
+                if peer.certificate.is_some() {
+                    peer.authenticated();
+                }
                 Transport::Tls(Box::new(stream))
             }
         };
@@ -201,18 +295,11 @@ impl Opener {
             Transport::Tls(stream) => stream.read_exact(&mut preface).await?,
         };
 
-        let closing = Arc::new(Closing::default());
         Ok(Connection {
             transport,
             preface: io::Cursor::new(preface),
-            closed: Box::pin(closing.now.clone().notified_owned()),
-            peer: Peer {
-                id: self.last_id.fetch_add(1, Ordering::Relaxed),
-                address,
-                health: Arc::new(Semaphore::new(MOST_HEALTH_CALLS)),
-                certificate,
-                closing,
-            },
+            closed: Box::pin(peer.closing.now.clone().notified_owned()),
+            peer,
             _place: place,
         })
     }
