@@ -78,8 +78,8 @@ pub fn start_log(format: LogFormat, traces: Option<&Traces>) -> Log {
     };
 
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| {
-        // The server logs failed exports itself, once. OpenTelemetry would log each, with text of the
-        // collector of any length.
+        // The server logs failed exports itself, once. OpenTelemetry would log each, with text of
+        // the collector of any length.
         EnvFilter::new("info,hnsw_rs=warn,opentelemetry=off,opentelemetry_sdk=off,opentelemetry-otlp=off,opentelemetry_otlp=off")
     });
     // As no-color.org specifies, any non-empty NO_COLOR turns colors off.

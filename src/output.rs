@@ -125,8 +125,8 @@ pub fn is_silent() -> bool {
     IS_SILENT.load(Ordering::Relaxed)
 }
 
-/// Prints a line, or several, to standard output. Control characters within a line are left out: the
-/// text may come from a server.
+/// Prints a line, or several, to standard output. Control characters within a line are left out:
+/// the text may come from a server.
 pub fn say(line: impl std::fmt::Display) {
     if !is_silent() {
         print(format!("{}\n", printable(&line.to_string())).as_bytes());

@@ -127,8 +127,8 @@ pub struct Serve {
     /// omitted
     #[arg(long, env = "SEESE3_MAX_STORED_REVISIONS", value_parser = clap::value_parser!(u64).range(1..))]
     max_stored_revisions: Option<u64>,
-    /// Size of a room and the adapters named after it in the store, bytes, from which on changes are
-    /// refused; no limit if omitted
+    /// Size of a room and the adapters named after it in the store, bytes, from which on changes
+    /// are refused; no limit if omitted
     #[arg(long, env = "SEESE3_MAX_STORED_BYTES", value_parser = clap::value_parser!(u64).range(1..))]
     max_stored_bytes: Option<u64>,
     /// Memory limit of all uploads in progress, 1048576 to 1099511627776 bytes
@@ -164,8 +164,8 @@ pub struct Serve {
     #[arg(long, value_name = "FILE", env = "SEESE3_TOKEN_KEY_FILE")]
     token_key_file: Option<PathBuf>,
     /// Threads for short requests, and as many for requests with one or two images, 1 to 1024. Long
-    /// requests and evaluations get half as many each, rounded up; fits have one. Also the number of
-    /// threads of an onnxruntime session. The number of cores if omitted
+    /// requests and evaluations get half as many each, rounded up; fits have one. Also the number
+    /// of threads of an onnxruntime session. The number of cores if omitted
     #[arg(long, env = "SEESE3_THREADS", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
     /// Maximum number of waiting requests of each of these kinds, 0 to 1000000; further ones are

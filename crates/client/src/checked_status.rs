@@ -88,8 +88,8 @@ fn remove_malformed(headers: &mut http::HeaderMap) {
 mod tests {
     use super::*;
 
-    /// Oracle: RFC 4648: four characters are three bytes, three are two bytes without their padding, and
-    /// one is none.
+    /// Oracle: RFC 4648: four characters are three bytes, three are two bytes without their
+    /// padding, and one is none.
     #[test]
     fn only_malformed_details_are_removed() {
         for (details, is_kept) in [

@@ -151,8 +151,8 @@ impl Error {
     }
 }
 
-/// What the server refused, or why the connection to it broke: only the client's own transport gives a
-/// status a source.
+/// What the server refused, or why the connection to it broke: only the client's own transport
+/// gives a status a source.
 fn described(status: &Status) -> String {
     let Some(mut cause) = std::error::Error::source(status) else {
         let message = one_line(status.message());
@@ -773,8 +773,8 @@ impl Client {
 mod tests {
     use super::*;
 
-    /// Oracle: the contract: no call waits longer than its deadline for a server that says nothing, an
-    /// upload of many messages included.
+    /// Oracle: the contract: no call waits longer than its deadline for a server that says nothing,
+    /// an upload of many messages included.
     #[tokio::test]
     async fn a_silent_server_is_given_up() {
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
@@ -806,7 +806,8 @@ mod tests {
         assert!(matches!(call, Err(Error::Deadline)), "{call:?}");
     }
 
-    /// Oracle: the contract: a list ends at its last page, and one whose token comes again has no end.
+    /// Oracle: the contract: a list ends at its last page, and one whose token comes again has no
+    /// end.
     #[test]
     fn a_list_without_an_end_is_refused() {
         let mut pages = Pages::default();
@@ -838,7 +839,8 @@ mod tests {
         assert!(matches!(refused, Err(Error::Address { .. })), "{refused:?}");
     }
 
-    /// Oracle: the contract: a server's refusal is quoted in one line; a broken connection is no refusal.
+    /// Oracle: the contract: a server's refusal is quoted in one line; a broken connection is no
+    /// refusal.
     #[test]
     fn a_broken_connection_is_no_refusal() {
         let refused = Error::from(Status::not_found("no\nroom"));

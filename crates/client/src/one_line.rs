@@ -1,7 +1,7 @@
 //! Text from a server, for terminals.
 
-/// The text as one line without control characters, which could change what a terminal shows: ASCII and
-/// Unicode controls, line breaks, and the marks that reverse the direction of text.
+/// The text as one line without control characters, which could change what a terminal shows: ASCII
+/// and Unicode controls, line breaks, and the marks that reverse the direction of text.
 pub fn one_line(text: &str) -> String {
     let is_shown = |c: char| {
         let is_mark = matches!(c, '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}');

@@ -156,8 +156,8 @@ fn environment(library: Option<&Path>) -> Result<&'static Environment, Error> {
         builder
             .with_name("seese3")
             .with_telemetry(false)
-            // onnxruntime would write to standard error, past the program's log, and wait for it. What
-            // fails is returned as an error too.
+            // onnxruntime would write to standard error, past the program's log, and wait for it.
+            // What fails is returned as an error too.
             .with_logger(Arc::new(|_, _, _, _, _| ()))
             .build()
             .map_err(|error| error.to_string())

@@ -160,7 +160,8 @@ mod tests {
 
     use super::*;
 
-    /// Oracle: the contract: a panic is caught and not printed, and other panics are printed as before.
+    /// Oracle: the contract: a panic is caught and not printed, and other panics are printed as
+    /// before.
     #[test]
     fn panics_are_caught_in_silence() {
         static PRINTED: AtomicUsize = AtomicUsize::new(0);

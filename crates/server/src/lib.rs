@@ -109,8 +109,8 @@ use snapshot::Loader;
 use workers::{Lane, Workers};
 
 /// Maximum number of blocking threads that a server may need, of tokio's runtime
-/// (`max_blocking_threads`): those of jobs that run, are paused or wait for the disk, and of reads of
-/// the store.
+/// (`max_blocking_threads`): those of jobs that run, are paused or wait for the disk, and of reads
+/// of the store.
 pub const MAX_BLOCKING_THREADS: usize = 2_048;
 /// Divisor for the memory budget of images that are decoded: 1/4 of the request budget.
 const DECODING: usize = 4;

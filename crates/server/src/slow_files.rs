@@ -19,8 +19,8 @@ pub async fn read_logged_if_slow<T: Send + 'static>(
     logged_if_slow(what, tokio::task::spawn_blocking(read)).await
 }
 
-/// Waits for `read`. Logs that reading `what` takes long, and goes on waiting: a second attempt would
-/// use another thread and wait too.
+/// Waits for `read`. Logs that reading `what` takes long, and goes on waiting: a second attempt
+/// would use another thread and wait too.
 pub async fn logged_if_slow<T>(what: &str, read: impl Future<Output = T>) -> T {
     let mut read = pin!(read);
     if let Ok(read) = tokio::time::timeout(LIMIT, &mut read).await {

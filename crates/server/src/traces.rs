@@ -30,8 +30,8 @@ use super::status::brief;
 /// Timeout of one export, and of the last export at shutdown.
 const EXPORT: Duration = Duration::from_secs(5);
 
-/// Maximum length of a caller's trace header, bytes. W3C Trace Context asks for 512 of `tracestate`; a
-/// longer one is left out.
+/// Maximum length of a caller's trace header, bytes. W3C Trace Context asks for 512 of
+/// `tracestate`; a longer one is left out.
 const LONGEST_HEADER: usize = 512;
 
 /// A span exporter. Dropping it sends the queued spans.
@@ -89,8 +89,8 @@ impl Traces {
     }
 }
 
-/// An exporter whose failures are logged when they begin and end. OpenTelemetry logs each of them, and
-/// what the collector says.
+/// An exporter whose failures are logged when they begin and end. OpenTelemetry logs each of them,
+/// and what the collector says.
 #[derive(Debug)]
 struct LoggedExporter {
     exporter: SpanExporter,

@@ -72,8 +72,8 @@ impl Store {
         Ok(usage)
     }
 
-    /// The names of all rooms, or adapters, with files in the store, also of those whose revisions were
-    /// all removed; sorted.
+    /// The names of all rooms, or adapters, with files in the store, also of those whose revisions
+    /// were all removed; sorted.
     ///
     /// # Errors
     /// [`Error::Io`] if the store cannot be listed.

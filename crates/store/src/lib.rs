@@ -631,8 +631,8 @@ impl Store {
             numbers.highest = numbers.highest.max(number);
         }
 
-        // A removal may be interrupted before it deletes the manifest, and a stalled publication may
-        // write the manifest of a number that was published and removed meanwhile.
+        // A removal may be interrupted before it deletes the manifest, and a stalled publication
+        // may write the manifest of a number that was published and removed meanwhile.
         numbers.present.retain(|number| !gone.contains(number));
         numbers.present.sort_unstable();
         Ok(numbers)

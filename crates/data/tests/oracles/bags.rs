@@ -328,8 +328,8 @@ impl Changed {
     }
 }
 
-/// Oracle: the contract: columns and tables that compute their content are refused. Such a file of a
-/// few kilobytes would be read for hours.
+/// Oracle: the contract: columns and tables that compute their content are refused. Such a file of
+/// a few kilobytes would be read for hours.
 #[test]
 fn computed_tables_are_refused() {
     let generated = "ALTER TABLE messages RENAME TO kept; CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id INTEGER, \

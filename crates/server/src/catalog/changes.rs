@@ -99,8 +99,8 @@ impl Changes {
         })
     }
 
-    /// Runs the checks of a `validate_only` request on a blocking thread, within the caller's share of
-    /// queued changes.
+    /// Runs the checks of a `validate_only` request on a blocking thread, within the caller's share
+    /// of queued changes.
     ///
     /// # Errors
     /// The errors of the check; [`Error::Full`] if too many changes are queued.
@@ -226,8 +226,8 @@ impl Handlers {
         })
     }
 
-    /// The snapshot of the store as it is now, limited to the rooms that the caller may see: another
-    /// program may have published an adapter that the caller names.
+    /// The snapshot of the store as it is now, limited to the rooms that the caller may see:
+    /// another program may have published an adapter that the caller names.
     ///
     /// # Errors
     /// As [`Handlers::changes`].

@@ -75,8 +75,8 @@ impl Quotas {
     }
 }
 
-/// The room that an adapter is named after: the longest name of a room with which the adapter's name
-/// begins, before a dot.
+/// The room that an adapter is named after: the longest name of a room with which the adapter's
+/// name begins, before a dot.
 pub fn owner<'a>(adapter: &str, rooms: impl IntoIterator<Item = &'a String>) -> Option<&'a str> {
     let is_before = |room: &&String| {
         let rest = adapter.strip_prefix(room.as_str());

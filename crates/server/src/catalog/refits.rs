@@ -109,8 +109,8 @@ impl Handlers {
         })
     }
 
-    /// Checks that a fitted adapter is named after its room, and not after another room whose name is
-    /// longer.
+    /// Checks that a fitted adapter is named after its room, and not after another room whose name
+    /// is longer.
     ///
     /// # Errors
     /// [`Error::Invalid`] if not.
@@ -241,8 +241,8 @@ impl FitProgress {
         self.send();
     }
 
-    /// Sends the progress every second, also while the fit waits for its turn, so that the caller can
-    /// tell a waiting fit from a broken connection. Never completes.
+    /// Sends the progress every second, also while the fit waits for its turn, so that the caller
+    /// can tell a waiting fit from a broken connection. Never completes.
     async fn repeated(&self) {
         loop {
             tokio::time::sleep(Duration::from_secs(1)).await;

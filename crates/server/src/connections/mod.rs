@@ -140,8 +140,8 @@ pub struct Acceptance {
     pub metrics: Metrics,
 }
 
-/// Stream of the connections that `listener` accepts. Dropping the stream drops the listener and the
-/// connections being opened.
+/// Stream of the connections that `listener` accepts. Dropping the stream drops the listener and
+/// the connections being opened.
 pub fn incoming(
     listener: TcpListener,
     acceptance: Acceptance,

@@ -15,8 +15,8 @@ use std::time::Duration;
 
 use super::super::caller::CallerId;
 
-/// Number of paused jobs of a caller from which on it begins no new ones. Each keeps a thread of the
-/// operating system.
+/// Number of paused jobs of a caller from which on it begins no new ones. Each keeps a thread of
+/// the operating system.
 const MOST_PAUSED_OF_CALLER: usize = 4;
 /// Number of idle callers that are kept before the queue removes those without debt.
 const MOST_IDLE: usize = 64;
@@ -308,7 +308,8 @@ mod tests {
         assert!(queue.is_empty());
     }
 
-    /// Oracle: the contract, by hand: a caller begins new requests while fewer than four are paused.
+    /// Oracle: the contract, by hand: a caller begins new requests while fewer than four are
+    /// paused.
     #[test]
     fn a_caller_pauses_few_requests() {
         let mut queue = FairQueue::default();

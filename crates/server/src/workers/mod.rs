@@ -373,8 +373,8 @@ mod tests {
         assert_eq!(first.await.unwrap(), Ok(1));
     }
 
-    /// Oracle: the contract: a job that checks for cancellation passes its only thread on to the job
-    /// of another caller, and then goes on.
+    /// Oracle: the contract: a job that checks for cancellation passes its only thread on to the
+    /// job of another caller, and then goes on.
     #[tokio::test]
     async fn a_long_job_is_paused_while_others_wait() {
         let workers = workers(1, 8);
@@ -400,8 +400,8 @@ mod tests {
         assert_eq!(first.await.unwrap(), Ok(1));
     }
 
-    /// Oracle: the contract, and the rule of the shares by hand: jobs that wait for the disk hold no thread
-    /// of the lane; of 64 places one caller gets 32; each goes on when the disk answers.
+    /// Oracle: the contract, and the rule of the shares by hand: jobs that wait for the disk hold
+    /// no thread of the lane; of 64 places one caller gets 32; each goes on when the disk answers.
     #[tokio::test]
     async fn jobs_that_wait_for_the_disk_hold_no_thread() {
         let workers = workers(1, 8);

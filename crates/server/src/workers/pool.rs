@@ -230,7 +230,8 @@ impl Turn {
 }
 
 /// Runs work that waits for something else than a thread, such as the disk, while the lane's thread
-/// serves other jobs. Blocks the thread of the operating system. On other threads it only runs the work.
+/// serves other jobs. Blocks the thread of the operating system. On other threads it only runs the
+/// work.
 ///
 /// # Errors
 /// The limit of waiting jobs that is reached.

@@ -581,7 +581,8 @@ async fn only_those_who_may_change_what_they_may() {
 }
 
 /// Oracle: the bound on waiting changes of one caller, half of 64: each is made or refused as one
-/// too many, and the server goes on. More than one blocking thread each would be more than there are.
+/// too many, and the server goes on. More than one blocking thread each would be more than there
+/// are.
 #[tokio::test]
 async fn many_changes_at_once_are_made_or_refused() {
     let (server, store) = start_writable().await;

@@ -167,8 +167,8 @@ async fn a_second_message_is_not_decoded() {
     assert!(metrics.text().contains(refused), "{}", metrics.text());
 }
 
-/// Oracle: the contract: a message of a stream is counted while it is worked on, not until the stream
-/// ends. A refused frame of 1 MB leaves what an idle stream holds.
+/// Oracle: the contract: a message of a stream is counted while it is worked on, not until the
+/// stream ends. A refused frame of 1 MB leaves what an idle stream holds.
 #[tokio::test]
 async fn an_idle_stream_holds_nothing_of_its_messages() {
     let metrics = Metrics::default();

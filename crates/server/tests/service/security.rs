@@ -436,8 +436,8 @@ async fn a_certificate_is_needed_and_says_who_is_calling() {
     });
 }
 
-/// Oracle: the contract: who has no credential cannot keep others out by holding connections, neither
-/// silent ones nor open ones, and does not end those of others.
+/// Oracle: the contract: who has no credential cannot keep others out by holding connections,
+/// neither silent ones nor open ones, and does not end those of others.
 #[tokio::test]
 async fn connections_without_credentials_make_room() {
     let config = Config {

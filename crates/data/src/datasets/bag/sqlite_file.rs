@@ -78,8 +78,8 @@ fn limit_instructions(database: &mut Connection, file: &Path) -> rusqlite::Resul
     database.progress_handler(INSTRUCTIONS_PER_CHECK as i32, Some(is_over))
 }
 
-/// Whether the database has this table, with plain columns only. Views, virtual tables and generated
-/// columns are not accepted: they compute what is not in the file, without a bound.
+/// Whether the database has this table, with plain columns only. Views, virtual tables and
+/// generated columns are not accepted: they compute what is not in the file, without a bound.
 fn has_table(database: &Connection, name: &str) -> rusqlite::Result<bool> {
     let query = "SELECT count(*) FROM sqlite_schema AS one WHERE type = 'table' AND name = ?1 AND rootpage > 0 \
                  AND NOT EXISTS (SELECT * FROM pragma_table_xinfo(one.name) WHERE hidden <> 0)";
