@@ -3,7 +3,6 @@
 check: test lean lint doc hygiene e2e
 
 test:
-    cargo test --workspace
     cargo test --workspace --features full
 
 # The tests that need the folder of large inputs, SEESE3_SHARED or ../shared.
@@ -33,7 +32,7 @@ api:
 settle-api:
     buf build proto --exclude-source-info -o proto/settled.binpb
 
-# The features that `test` does not build: none, and stores in buckets.
+# The sets of features that `test` does not build. `lint` builds the default one.
 lean:
     cargo check --no-default-features
     cargo check --features cloud

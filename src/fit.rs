@@ -43,9 +43,10 @@ impl Fit {
             base: self.adapter,
             features: self.features,
             name: self.name,
+            own_names_only: false,
             seed: self.seed,
         };
-        let refit = Refit::prepare(&store, request).await?;
+        let mut refit = Refit::prepare(&store, request).await?;
 
         let progress = fitting_bar(true);
         let fitted = refit.fit(FitRun {

@@ -64,7 +64,8 @@ pub struct Serve {
         requires = "tls_cert"
     )]
     tls_client_ca: Option<PathBuf>,
-    /// Maximum number of connections, 1 to 1000000; further ones are closed at once
+    /// Maximum number of connections, 1 to 1000000; with --auth-file, callers divide them, otherwise
+    /// further ones are closed at once
     #[arg(long, env = "SEESE3_MAX_CONNECTIONS", default_value_t = Config::default().connections, value_parser = bounded(1, 1_000_000))]
     max_connections: usize,
     /// Index for the nearest-frame search
@@ -123,12 +124,12 @@ pub struct Serve {
     /// pixels in width. Images are read from the room's original folder
     #[arg(long, env = "SEESE3_THUMBNAILS")]
     thumbnails: bool,
-    /// Maximum number of stored revisions of a room and the adapters named after it; no limit if
-    /// omitted
+    /// Maximum number of stored revisions of a room, with the adapters named after it and fitted to
+    /// it; no limit if omitted
     #[arg(long, env = "SEESE3_MAX_STORED_REVISIONS", value_parser = clap::value_parser!(u64).range(1..))]
     max_stored_revisions: Option<u64>,
-    /// Size of a room and the adapters named after it in the store, bytes, from which on changes
-    /// are refused; no limit if omitted
+    /// Size in the store of a room, with the adapters named after it and fitted to it, bytes, from
+    /// which on publications are refused; no limit if omitted
     #[arg(long, env = "SEESE3_MAX_STORED_BYTES", value_parser = clap::value_parser!(u64).range(1..))]
     max_stored_bytes: Option<u64>,
     /// Memory limit of all uploads in progress, 1048576 to 1099511627776 bytes

@@ -1,29 +1,17 @@
 //! A client of the service, in wire types. Error messages are one line.
 
-use std::pin::pin;
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use tokio::time::Instant;
-use tokio_stream::{Stream, StreamExt as _};
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::service::Interceptor;
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
-use tonic::{Code, Status, Streaming};
-use tonic_health::pb::HealthCheckRequest;
-use tonic_health::pb::health_check_response::ServingStatus;
-use tonic_health::pb::health_client::HealthClient;
+use tonic::{Code, Status};
 use tonic_types::StatusExt;
 
 use crate::checked_status::CheckedStatus;
 use crate::one_line::one_line;
-use crate::proto::v1 as pb;
-use crate::proto::v1::catalog_service_client::CatalogServiceClient;
-use crate::proto::v1::evaluation_service_client::EvaluationServiceClient;
-use crate::proto::v1::localization_service_client::LocalizationServiceClient;
-use crate::proto::v1::navigation_service_client::NavigationServiceClient;
-use crate::proto::v1::odometry_service_client::OdometryServiceClient;
 
 /// Time limit for opening a connection, the TLS handshake included.
 const LONGEST_CONNECTING: Duration = Duration::from_secs(10);
@@ -31,72 +19,15 @@ const LONGEST_CONNECTING: Duration = Duration::from_secs(10);
 const SILENCE: Duration = Duration::from_secs(10);
 /// Time limit for the answer to a ping. A connection without one is closed, and its calls fail.
 const PING_ANSWER: Duration = Duration::from_secs(10);
-/// Maximum number of pages of a list. A server's page has up to 1,000 entries.
-const MOST_PAGES: usize = 10_000;
-/// Maximum size of a response, bytes.
-const MESSAGE_BYTES: usize = 64 << 20;
-
-/// The time at which the connection took the last message of an upload.
-#[derive(Debug, Clone)]
-struct LastTaken(Arc<Mutex<Instant>>);
-
-impl LastTaken {
-    fn get(&self) -> Instant {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    fn set_now(&self) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
-    }
-}
-
-/// The messages of an upload, and the time at which the connection took the last one.
-fn observed<M: Send + 'static>(
-    messages: impl Stream<Item = M> + Send + 'static,
-) -> (impl Stream<Item = M> + Send + 'static, LastTaken) {
-    let last_taken = LastTaken(Arc::new(Mutex::new(Instant::now())));
-    let taken = last_taken.clone();
-    let messages = messages.map(move |message| {
-        taken.set_now();
-        message
-    });
-    (messages, last_taken)
-}
 
 /// The result of a call that ends until `until`. tonic's own deadline ends with the headers of the
 /// response.
-async fn in_time<T>(
+pub(crate) async fn in_time<T>(
     until: Instant,
     call: impl Future<Output = Result<T, Status>>,
 ) -> Result<T, Error> {
     let answer = tokio::time::timeout_at(until, call).await;
     Ok(answer.map_err(|_| Error::Deadline)??)
-}
-
-/// The pages of a list.
-#[derive(Debug, Default)]
-struct Pages {
-    count: usize,
-    token: String,
-}
-
-impl Pages {
-    /// Goes on to the page of `token`. Returns whether there is one.
-    ///
-    /// # Errors
-    /// [`Error::EndlessList`] if the list has no end: a token that comes twice in a row, or more than
-    /// [`MOST_PAGES`].
-    fn go_on(&mut self, token: String) -> Result<bool, Error> {
-        if token.is_empty() {
-            return Ok(false);
-        }
-        self.count += 1;
-        if token == self.token || self.count == MOST_PAGES {
-            return Err(Error::EndlessList);
-        }
-        self.token = token;
-        Ok(true)
-    }
 }
 
 /// Why a call failed.
@@ -178,8 +109,8 @@ impl From<Status> for Error {
 /// A connection to a server. Clones are cheap and share the connection.
 #[derive(Debug, Clone)]
 pub struct Client {
-    channel: InterceptedService<CheckedStatus<Channel>, Token>,
-    deadline: Duration,
+    pub(crate) channel: InterceptedService<CheckedStatus<Channel>, Token>,
+    pub(crate) deadline: Duration,
 }
 
 /// Options of a connection.
@@ -205,7 +136,7 @@ pub struct ClientTls {
 
 /// Adds the token to every call.
 #[derive(Debug, Clone)]
-struct Token(Option<MetadataValue<Ascii>>);
+pub(crate) struct Token(pub(crate) Option<MetadataValue<Ascii>>);
 
 impl Interceptor for Token {
     fn call(&mut self, mut request: tonic::Request<()>) -> Result<tonic::Request<()>, Status> {
@@ -310,458 +241,15 @@ impl Client {
         })
     }
 
-    /// Navigates from a view by a motion.
-    ///
-    /// # Errors
-    /// [`Error::Refused`] if the server refuses the request, [`Error::Deadline`] without a response
-    /// in time. This holds for every call.
-    pub async fn navigate(
-        &self,
-        request: pb::NavigateRequest,
-    ) -> Result<pb::NavigateResponse, Error> {
-        let mut service = NavigationServiceClient::new(self.channel.clone())
-            .max_decoding_message_size(MESSAGE_BYTES);
-        Ok(self
-            .in_time(service.navigate(self.request(request)))
-            .await?
-            .into_inner())
-    }
-
-    /// Several navigation requests in one call. Results are in the order of the requests.
-    ///
-    /// # Errors
-    /// [`Error::Refused`] if the whole batch is refused. The failure of a single request is part of
-    /// the results.
-    pub async fn batch_navigate(
-        &self,
-        requests: Vec<pb::NavigateRequest>,
-    ) -> Result<Vec<pb::BatchNavigateResult>, Error> {
-        let mut service = NavigationServiceClient::new(self.channel.clone())
-            .max_decoding_message_size(MESSAGE_BYTES);
-        Ok(self
-            .in_time(service.batch_navigate(self.request(pb::BatchNavigateRequest { requests })))
-            .await?
-            .into_inner()
-            .results)
-    }
-
-    /// Navigates to a goal. `feedback` is called for each feedback message.
-    ///
-    /// # Errors
-    /// [`Error::Refused`], or [`Error::NoReport`] if the stream ends without a result.
-    pub async fn navigate_to(
-        &self,
-        request: pb::NavigateToRequest,
-        mut feedback: impl FnMut(pb::NavigateToFeedback),
-    ) -> Result<pb::NavigateToResult, Error> {
-        let mut service = NavigationServiceClient::new(self.channel.clone());
-        let until = Instant::now() + self.deadline;
-        let opened = in_time(until, service.navigate_to(self.request(request))).await?;
-        let mut events = opened.into_inner();
-
-        while let Some(pb::NavigateToResponse { event }) = in_time(until, events.message()).await? {
-            match event {
-                Some(pb::navigate_to_response::Event::Result(result)) => return Ok(result),
-                Some(pb::navigate_to_response::Event::Feedback(step)) => feedback(step),
-                None => {}
-            }
-        }
-
-        Err(Error::NoReport)
-    }
-
-    /// The stored frames most similar to a view, with their poses.
-    ///
-    /// # Errors
-    /// [`Error::Refused`].
-    pub async fn localize(
-        &self,
-        request: pb::LocalizeRequest,
-    ) -> Result<pb::LocalizeResponse, Error> {
-        let mut service = LocalizationServiceClient::new(self.channel.clone())
-            .max_decoding_message_size(MESSAGE_BYTES);
-        Ok(self
-            .in_time(service.localize(self.request(request)))
-            .await?
-            .into_inner())
-    }
-
-    /// The rooms ranked by their match with the given views, and the pose in each.
-    ///
-    /// # Errors
-    /// [`Error::Refused`].
-    pub async fn relocalize(
-        &self,
-        request: pb::RelocalizeRequest,
-    ) -> Result<pb::RelocalizeResponse, Error> {
-        let mut service = LocalizationServiceClient::new(self.channel.clone())
-            .max_decoding_message_size(MESSAGE_BYTES);
-        Ok(self
-            .in_time(service.relocalize(self.request(request)))
-            .await?
-            .into_inner())
-    }
-
-    /// Estimates the motion between two views.
-    ///
-    /// # Errors
-    /// [`Error::Refused`].
-    pub async fn estimate_motion(
-        &self,
-        request: pb::EstimateMotionRequest,
-    ) -> Result<pb::EstimateMotionResponse, Error> {
-        let mut service = OdometryServiceClient::new(self.channel.clone());
-        Ok(self
-            .in_time(service.estimate_motion(self.request(request)))
-            .await?
-            .into_inner())
-    }
-
-    /// Computes the latents of views.
-    ///
-    /// # Errors
-    /// [`Error::Refused`].
-    pub async fn encode(&self, request: pb::EncodeRequest) -> Result<pb::EncodeResponse, Error> {
-        let mut service = OdometryServiceClient::new(self.channel.clone())
-            .max_decoding_message_size(MESSAGE_BYTES);
-        Ok(self
-            .in_time(service.encode(self.request(request)))
-            .await?
-            .into_inner())
-    }
-
-    /// Opens a tracking stream: sends `requests` as they are produced and returns the stream of
-    /// responses. The deadline applies until the server accepts the first request, the
-    /// configuration. The stream itself has no deadline, because it lasts as long as the robot
-    /// moves.
-    ///
-    /// # Errors
-    /// [`Error::Refused`] if the stream cannot be opened, [`Error::Deadline`] without a response in
-    /// time. Later errors are items of the stream.
-    pub async fn track(
-        &self,
-        requests: impl Stream<Item = pb::TrackRequest> + Send + 'static,
-    ) -> Result<Streaming<pb::TrackResponse>, Error> {
-        let mut service = OdometryServiceClient::new(self.channel.clone())
-            .max_decoding_message_size(MESSAGE_BYTES);
-        Ok(self.in_time(service.track(requests)).await?.into_inner())
-    }
-
-    /// All frames of a room, read page by page. `neighbours_within` adds to each frame its
-    /// neighbors within this motion norm, meters and radians mixed. `thumbnail_width` adds a JPEG
-    /// of this width, pixels, if the server provides images.
-    ///
-    /// # Errors
-    /// [`Error::Refused`], also if the room changes between two pages; [`Error::EndlessList`].
-    pub async fn frames(
-        &self,
-        room: &str,
-        neighbours_within: Option<f64>,
-        thumbnail_width: Option<u32>,
-    ) -> Result<Vec<pb::RoomFrame>, Error> {
-        let mut service = CatalogServiceClient::new(self.channel.clone())
-            .max_decoding_message_size(MESSAGE_BYTES);
-        let mut frames = Vec::new();
-        let mut pages = Pages::default();
-        loop {
-            let request = self.request(pb::ListFramesRequest {
-                room: room.to_owned(),
-                page_size: 0,
-                page_token: pages.token.clone(),
-                neighbours_within,
-                thumbnail_width,
-            });
-            let page = self
-                .in_time(service.list_frames(request))
-                .await?
-                .into_inner();
-            frames.extend(page.frames);
-
-            if !pages.go_on(page.next_page_token)? {
-                return Ok(frames);
-            }
-        }
-    }
-
-    /// All rooms, read page by page.
-    ///
-    /// # Errors
-    /// [`Error::Refused`], [`Error::EndlessList`].
-    pub async fn rooms(&self) -> Result<Vec<pb::Room>, Error> {
-        let mut service = CatalogServiceClient::new(self.channel.clone());
-        let mut rooms = Vec::new();
-        let mut pages = Pages::default();
-        loop {
-            let request = self.request(pb::ListRoomsRequest {
-                page_size: 0,
-                page_token: pages.token.clone(),
-            });
-            let page = self
-                .in_time(service.list_rooms(request))
-                .await?
-                .into_inner();
-            rooms.extend(page.rooms);
-
-            if !pages.go_on(page.next_page_token)? {
-                return Ok(rooms);
-            }
-        }
-    }
-
-    /// One room, by name.
-    ///
-    /// # Errors
-    /// [`Error::Refused`].
-    pub async fn room(&self, room: &str) -> Result<Option<pb::Room>, Error> {
-        let mut service = CatalogServiceClient::new(self.channel.clone());
-        Ok(self
-            .in_time(service.get_room(self.request(pb::GetRoomRequest {
-                room: room.to_owned(),
-            })))
-            .await?
-            .into_inner()
-            .room)
-    }
-
-    /// All adapters, read page by page.
-    ///
-    /// # Errors
-    /// [`Error::Refused`], [`Error::EndlessList`].
-    pub async fn adapters(&self) -> Result<Vec<pb::Adapter>, Error> {
-        let mut service = CatalogServiceClient::new(self.channel.clone());
-        let mut adapters = Vec::new();
-        let mut pages = Pages::default();
-        loop {
-            let request = self.request(pb::ListAdaptersRequest {
-                page_size: 0,
-                page_token: pages.token.clone(),
-            });
-            let page = self
-                .in_time(service.list_adapters(request))
-                .await?
-                .into_inner();
-            adapters.extend(page.adapters);
-
-            if !pages.go_on(page.next_page_token)? {
-                return Ok(adapters);
-            }
-        }
-    }
-
-    /// One adapter, by name.
-    ///
-    /// # Errors
-    /// [`Error::Refused`].
-    pub async fn adapter(&self, adapter: &str) -> Result<Option<pb::Adapter>, Error> {
-        let mut service = CatalogServiceClient::new(self.channel.clone());
-        let request = self.request(pb::GetAdapterRequest {
-            adapter: adapter.to_owned(),
-        });
-
-        Ok(self
-            .in_time(service.get_adapter(request))
-            .await?
-            .into_inner()
-            .adapter)
-    }
-
-    /// Publishes a room from a `RoomUpload`, batches of frames and an `UploadEnd`, in this order.
-    ///
-    /// # Errors
-    /// [`Error::Refused`]; [`Error::Deadline`] if the connection takes no message for as long as the
-    /// deadline, or there is no response within it after the last one. The room may then still be
-    /// published.
-    pub async fn create_room(
-        &self,
-        messages: impl Stream<Item = pb::CreateRoomRequest> + Send + 'static,
-    ) -> Result<pb::CreateRoomResponse, Error> {
-        let mut service = CatalogServiceClient::new(self.channel.clone());
-        let (messages, last_taken) = observed(messages);
-        self.uploaded(service.create_room(messages), last_taken)
-            .await
-    }
-
-    /// Publishes an externally trained adapter from an `AdapterUpload` and its weights, in this
-    /// order.
-    ///
-    /// # Errors
-    /// As [`Client::create_room`].
-    pub async fn publish_adapter(
-        &self,
-        messages: impl Stream<Item = pb::PublishAdapterRequest> + Send + 'static,
-    ) -> Result<pb::PublishAdapterResponse, Error> {
-        let mut service = CatalogServiceClient::new(self.channel.clone());
-        let (messages, last_taken) = observed(messages);
-        self.uploaded(service.publish_adapter(messages), last_taken)
-            .await
-    }
-
-    /// Fits an adapter to a room on the server. `progress` is called for each progress message; the
-    /// server sends one every second, also while the fit waits for its turn.
-    ///
-    /// # Errors
-    /// [`Error::Refused`], [`Error::Deadline`] if no message comes for as long as the deadline, or
-    /// [`Error::NoReport`] if the stream ends without a result.
-    pub async fn refit_room(
-        &self,
-        request: pb::RefitRoomRequest,
-        mut progress: impl FnMut(pb::RefitProgress),
-    ) -> Result<pb::RefitResult, Error> {
-        let mut service = CatalogServiceClient::new(self.channel.clone());
-        let opened = self.in_time(service.refit_room(request)).await?;
-        let mut events = opened.into_inner();
-        while let Some(pb::RefitRoomResponse { event }) = self.in_time(events.message()).await? {
-            match event {
-                Some(pb::refit_room_response::Event::Result(result)) => return Ok(result),
-                Some(pb::refit_room_response::Event::Progress(step)) => progress(step),
-                None => {}
-            }
-        }
-
-        Err(Error::NoReport)
-    }
-
-    /// Sets or clears the default revision of a name or the default adapter of a room. Returns all
-    /// current defaults.
-    ///
-    /// # Errors
-    /// [`Error::Refused`].
-    pub async fn set_default(
-        &self,
-        request: pb::SetDefaultRequest,
-    ) -> Result<Vec<pb::Default>, Error> {
-        let mut service = CatalogServiceClient::new(self.channel.clone());
-        let answer = self
-            .in_time(service.set_default(self.request(request)))
-            .await?;
-        Ok(answer.into_inner().defaults)
-    }
-
-    /// Undoes the last change of a default. Returns all current defaults.
-    ///
-    /// # Errors
-    /// [`Error::Refused`].
-    pub async fn roll_back_default(
-        &self,
-        request: pb::RollBackDefaultRequest,
-    ) -> Result<Vec<pb::Default>, Error> {
-        let mut service = CatalogServiceClient::new(self.channel.clone());
-        let answer = self
-            .in_time(service.roll_back_default(self.request(request)))
-            .await?;
-        Ok(answer.into_inner().defaults)
-    }
-
-    /// Deletes a room or one of its revisions. Returns the deleted revisions.
-    ///
-    /// # Errors
-    /// [`Error::Refused`].
-    pub async fn delete_room(&self, request: pb::DeleteRoomRequest) -> Result<Vec<u64>, Error> {
-        let mut service = CatalogServiceClient::new(self.channel.clone());
-        let answer = self
-            .in_time(service.delete_room(self.request(request)))
-            .await?;
-        Ok(answer.into_inner().revisions)
-    }
-
-    /// Deletes an adapter or one of its revisions. Returns the deleted revisions.
-    ///
-    /// # Errors
-    /// [`Error::Refused`].
-    pub async fn delete_adapter(
-        &self,
-        request: pb::DeleteAdapterRequest,
-    ) -> Result<Vec<u64>, Error> {
-        let mut service = CatalogServiceClient::new(self.channel.clone());
-        let answer = self
-            .in_time(service.delete_adapter(self.request(request)))
-            .await?;
-        Ok(answer.into_inner().revisions)
-    }
-
-    /// Evaluates navigators on a room's test pairs. `progress` is called at the start of each
-    /// navigator.
-    ///
-    /// # Errors
-    /// [`Error::Refused`], or [`Error::NoReport`] if the stream ends without a report.
-    pub async fn evaluate(
-        &self,
-        request: pb::EvaluateRequest,
-        mut progress: impl FnMut(pb::EvaluationProgress),
-    ) -> Result<pb::EvaluationReport, Error> {
-        let mut service = EvaluationServiceClient::new(self.channel.clone())
-            .max_decoding_message_size(MESSAGE_BYTES);
-        let until = Instant::now() + self.deadline;
-        let opened = in_time(until, service.evaluate(self.request(request))).await?;
-        let mut events = opened.into_inner();
-        while let Some(pb::EvaluateResponse { event }) = in_time(until, events.message()).await? {
-            match event {
-                Some(pb::evaluate_response::Event::Report(report)) => return Ok(report),
-                Some(pb::evaluate_response::Event::Progress(step)) => progress(step),
-                None => {}
-            }
-        }
-
-        Err(Error::NoReport)
-    }
-
-    /// Scores external predictions.
-    ///
-    /// # Errors
-    /// [`Error::Refused`].
-    pub async fn score_predictions(
-        &self,
-        request: pb::ScorePredictionsRequest,
-    ) -> Result<pb::ScorePredictionsResponse, Error> {
-        let mut service = EvaluationServiceClient::new(self.channel.clone());
-        Ok(self
-            .in_time(service.score_predictions(self.request(request)))
-            .await?
-            .into_inner())
-    }
-
-    /// Health check: whether `name` is SERVING. `name` is `""` for the whole server, the full name
-    /// of a service, or `rooms/NAME`.
-    ///
-    /// # Errors
-    /// [`Error::Refused`], also for an unknown name.
-    pub async fn serves(&self, name: &str) -> Result<bool, Error> {
-        let mut health = HealthClient::new(self.channel.clone());
-        let request = self.request(HealthCheckRequest {
-            service: name.to_owned(),
-        });
-
-        Ok(self
-            .in_time(health.check(request))
-            .await?
-            .into_inner()
-            .status()
-            == ServingStatus::Serving)
-    }
-
-    /// The response to an upload, within the deadline after each message that the connection takes.
-    async fn uploaded<A>(
-        &self,
-        call: impl Future<Output = Result<tonic::Response<A>, Status>>,
-        last_taken: LastTaken,
-    ) -> Result<A, Error> {
-        let mut answer = pin!(call);
-        loop {
-            let last = last_taken.get();
-            match tokio::time::timeout_at(last + self.deadline, &mut answer).await {
-                Ok(answer) => return Ok(answer?.into_inner()),
-                Err(_) if last_taken.get() > last => {}
-                Err(_) => return Err(Error::Deadline),
-            }
-        }
-    }
-
     /// The result of a call within the deadline.
-    async fn in_time<T>(&self, call: impl Future<Output = Result<T, Status>>) -> Result<T, Error> {
+    pub(crate) async fn in_time<T>(
+        &self,
+        call: impl Future<Output = Result<T, Status>>,
+    ) -> Result<T, Error> {
         in_time(Instant::now() + self.deadline, call).await
     }
 
-    fn request<T>(&self, message: T) -> tonic::Request<T> {
+    pub(crate) fn request<T>(&self, message: T) -> tonic::Request<T> {
         let mut request = tonic::Request::new(message);
         request.set_timeout(self.deadline);
         request
@@ -772,57 +260,6 @@ impl Client {
 #[allow(clippy::unwrap_used, reason = "a failed step is a failed test")]
 mod tests {
     use super::*;
-
-    /// Oracle: the contract: no call waits longer than its deadline for a server that says nothing,
-    /// an upload of many messages included.
-    #[tokio::test]
-    async fn a_silent_server_is_given_up() {
-        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let address = listener.local_addr().unwrap().to_string();
-        let deadline = Duration::from_millis(200);
-        let client = Client::connect(&address, deadline).await.unwrap();
-
-        let frames = pb::FrameBatch {
-            poses: vec![0; 1 << 20],
-            ..pb::FrameBatch::default()
-        };
-        let message = Some(pb::create_room_request::Message::Frames(frames));
-        let messages = vec![pb::CreateRoomRequest { message }; 100];
-        let upload = client.create_room(tokio_stream::iter(messages)).await;
-        assert!(matches!(upload, Err(Error::Deadline)), "{upload:?}");
-        let upload = client.publish_adapter(tokio_stream::iter([])).await;
-        assert!(matches!(upload, Err(Error::Deadline)), "{upload:?}");
-        let fit = client
-            .refit_room(pb::RefitRoomRequest::default(), |_| ())
-            .await;
-        assert!(matches!(fit, Err(Error::Deadline)), "{fit:?}");
-        let stream = client.track(tokio_stream::iter([])).await;
-        assert!(
-            matches!(stream, Err(Error::Deadline)),
-            "{:?}",
-            stream.map(drop)
-        );
-        let call = client.navigate(pb::NavigateRequest::default()).await;
-        assert!(matches!(call, Err(Error::Deadline)), "{call:?}");
-    }
-
-    /// Oracle: the contract: a list ends at its last page, and one whose token comes again has no
-    /// end.
-    #[test]
-    fn a_list_without_an_end_is_refused() {
-        let mut pages = Pages::default();
-        assert!(matches!(pages.go_on("1".to_owned()), Ok(true)));
-        assert!(matches!(pages.go_on("2".to_owned()), Ok(true)));
-        assert!(matches!(pages.go_on(String::new()), Ok(false)));
-        assert!(matches!(
-            pages.go_on("2".to_owned()),
-            Err(Error::EndlessList)
-        ));
-
-        let mut pages = Pages::default();
-        let ends = (0..MOST_PAGES).map(|page| pages.go_on(page.to_string()).is_err());
-        assert_eq!(ends.filter(|ends| *ends).count(), 1);
-    }
 
     /// Oracle: the contract: TLS is not turned off by an address, and no connection is opened then.
     #[tokio::test]
@@ -855,32 +292,5 @@ mod tests {
             broken.to_string(),
             "the connection to the server broke: the peer is gone"
         );
-    }
-
-    /// Oracle: the contract: an upload that goes on may take longer than the deadline.
-    #[tokio::test(start_paused = true)]
-    async fn an_upload_that_goes_on_is_not_given_up() {
-        let deadline = Duration::from_secs(1);
-        let client = Client {
-            channel: InterceptedService::new(
-                CheckedStatus(Endpoint::from_static("http://127.0.0.1:9").connect_lazy()),
-                Token(None),
-            ),
-            deadline,
-        };
-        let (messages, last_taken) = observed(tokio_stream::iter(0..10));
-        let mut messages = pin!(messages);
-        let call = async {
-            while messages.next().await.is_some() {
-                tokio::time::sleep(deadline * 9 / 10).await;
-            }
-            Ok(tonic::Response::new(7))
-        };
-        assert!(matches!(client.uploaded(call, last_taken).await, Ok(7)));
-
-        let (_messages, last_taken) = observed(tokio_stream::iter([0]));
-        let call = std::future::pending::<Result<tonic::Response<()>, Status>>();
-        let given_up = client.uploaded(call, last_taken).await;
-        assert!(matches!(given_up, Err(Error::Deadline)));
     }
 }

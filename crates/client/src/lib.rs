@@ -47,6 +47,7 @@ mod checked_status;
 mod one_line;
 pub mod convert;
 mod client;
+mod calls;
 mod newest;
 
 pub use client::{Client, ClientTls, ConnectOptions, Error};

@@ -400,8 +400,7 @@ fn open_part(root: &Path, image: &str) -> Result<ImagePart, Error> {
         file: path.clone(),
         cause,
     };
-    let resolved = seese3_files::below(root, Path::new(name)).map_err(io)?;
-    let mut file = seese3_files::open(&resolved).map_err(io)?;
+    let mut file = seese3_files::open_below(root, Path::new(name)).map_err(io)?;
     let mut length = file.metadata().map_err(io)?.len();
 
     if let Some((_, offset, part_length)) = part {

@@ -69,20 +69,35 @@ pub fn read_text(path: &Path, most: u64) -> io::Result<String> {
         .map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "is not UTF-8 text"))
 }
 
-/// The path of a file below `root`, with all links resolved.
+/// Opens a regular file below `root`, also through links inside `root`.
 ///
 /// # Errors
-/// [`io::ErrorKind::InvalidInput`] if a link leads out of `root`; otherwise the error of resolving
-/// the links.
-pub fn below(root: &Path, file: &Path) -> io::Result<PathBuf> {
-    let path = root.join(file).canonicalize()?;
-    if path.starts_with(root.canonicalize()?) {
-        return Ok(path);
+/// [`io::ErrorKind::InvalidInput`] if a link leads out of `root`; otherwise as [`open`].
+pub fn open_below(root: &Path, file: &Path) -> io::Result<File> {
+    let path = root.join(file);
+    let opened = open(&path)?;
+    if location(&opened, &path)?.starts_with(root.canonicalize()?) {
+        return Ok(opened);
     }
     Err(io::Error::new(
         io::ErrorKind::InvalidInput,
         "is a link to a file outside the folder; copy the file into it",
     ))
+}
+
+/// Where an open file is. The path may lead elsewhere by now, so Linux is asked for the
+/// descriptor's.
+fn location(opened: &File, path: &Path) -> io::Result<PathBuf> {
+    #[cfg(target_os = "linux")]
+    {
+        use std::os::fd::AsRawFd;
+        let link = format!("/proc/self/fd/{}", opened.as_raw_fd());
+        if let Ok(location) = std::fs::read_link(link) {
+            return Ok(location);
+        }
+    }
+    let _ = opened;
+    path.canonicalize()
 }
 
 #[cfg(test)]
@@ -143,9 +158,49 @@ mod tests {
         symlink("in.png", root.join("inside")).unwrap();
         symlink("../out.png", root.join("outside")).unwrap();
 
-        assert!(below(&root, Path::new("in.png")).is_ok());
-        assert!(below(&root, Path::new("inside")).is_ok());
-        let error = below(&root, Path::new("outside")).unwrap_err();
+        for file in ["in.png", "inside"] {
+            let opened = open_below(&root, Path::new(file)).unwrap();
+            assert_eq!(io::read_to_string(opened).unwrap(), "in");
+        }
+        let error = open_below(&root, Path::new("outside")).unwrap_err();
         assert_eq!(error.kind(), io::ErrorKind::InvalidInput);
+    }
+
+    /// Oracle: the contract, while another thread repeatedly retargets a link of a folder.
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn a_replaced_link_leads_only_inside() {
+        use std::os::unix::fs::symlink;
+        use std::sync::atomic::{AtomicBool, Ordering};
+
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path().join("recording");
+        for (name, text) in [("recording/inside", "in"), ("outside", "out")] {
+            let within = folder.path().join(name);
+            std::fs::create_dir_all(&within).unwrap();
+            std::fs::write(within.join("a.png"), text).unwrap();
+        }
+        symlink("inside", root.join("link")).unwrap();
+
+        let is_done = AtomicBool::new(false);
+        let read = std::thread::scope(|scope| {
+            scope.spawn(|| {
+                let next = root.join("next");
+                for target in ["../outside", "inside"].into_iter().cycle() {
+                    if is_done.load(Ordering::Relaxed) {
+                        return;
+                    }
+                    symlink(target, &next).unwrap();
+                    std::fs::rename(&next, root.join("link")).unwrap();
+                }
+            });
+            let opened =
+                (0..20_000).filter_map(|_| open_below(&root, Path::new("link/a.png")).ok());
+            let read: Vec<String> = opened.flat_map(io::read_to_string).collect();
+            is_done.store(true, Ordering::Relaxed);
+            read
+        });
+        assert!(read.len() > 100, "{}", read.len());
+        assert!(read.iter().all(|text| text == "in"));
     }
 }

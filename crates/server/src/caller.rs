@@ -8,7 +8,7 @@ use tonic::Request;
 
 use super::auth::{Principal, RoomScope};
 use super::connections::Peer;
-use super::quota::Quota;
+use seese3_store::Quota;
 
 /// A caller: the authenticated principal, or the connection on a server without credentials.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]

@@ -34,7 +34,6 @@ mod decoding;
 mod image_encoder;
 mod request_metrics;
 mod operations;
-mod quota;
 mod auth;
 mod caller;
 mod shares;
@@ -62,8 +61,8 @@ pub use auth::{AuthError, Keyring};
 pub use convert::{camera_to_wire, source_to_wire};
 pub use image_encoder::ImageEncoders;
 pub use metrics::Metrics;
-pub use quota::Quota;
 pub use reload::Reload;
+pub use seese3_store::Quota;
 pub use shutdown::shutdown_signal;
 pub use snapshot::{RoomMemory, Snapshot};
 pub use status::{Error, Full};
@@ -145,7 +144,8 @@ pub struct Config {
     pub writable: bool,
     /// Whether callers may get the rooms' images as thumbnails.
     pub thumbnails: bool,
-    /// The most that each room may take in the store, with the adapters named after it.
+    /// The most that each room may take in the store, with the adapters named after it and
+    /// fitted to it.
     pub room_quota: Quota,
     /// Memory budget of all uploads in progress together, bytes.
     pub upload_bytes: usize,
@@ -172,8 +172,8 @@ pub struct Config {
     pub reload: Reload,
     /// The server's metrics.
     pub metrics: Metrics,
-    /// Maximum number of connections. Beyond it, one is closed for each new one: with `keyring` the
-    /// oldest without an authenticated call, otherwise the new one.
+    /// Maximum number of connections. With `keyring`, callers divide them; otherwise further ones
+    /// are closed at once.
     pub connections: usize,
     /// The server's certificate; `None` for plain text.
     pub tls: Option<Arc<Tls>>,

@@ -43,6 +43,9 @@ pub enum Full {
     CallersRequests,
     /// The connections. A refused connection is closed without an error message.
     Connections,
+    /// The connections of one caller, while others need theirs.
+    #[strum(serialize = "connections of this caller, which can share one")]
+    CallersConnections,
     /// The bytes of all uploads in progress.
     #[strum(serialize = "bytes of uploads")]
     Uploads,
@@ -99,8 +102,8 @@ pub enum Error {
     #[error("the server is busy: the limit of {what} is reached; try again later")]
     #[strum(serialize = "BUSY")]
     Full { what: Full },
-    #[error("{used}; delete what is not needed, or ask the operator for a larger quota")]
-    Quota { used: String },
+    #[error("{problem}")]
+    Quota { problem: String },
     #[error("this server has no such RPC")]
     #[strum(serialize = "UNKNOWN_RPC")]
     UnknownPath,
@@ -411,7 +414,7 @@ mod tests {
                 },
                 "RESOURCE_EXHAUSTED",
             ),
-            (Error::Quota { used: name() }, "FAILED_PRECONDITION"),
+            (Error::Quota { problem: name() }, "FAILED_PRECONDITION"),
             (Error::UnknownPath, "UNIMPLEMENTED"),
             (Error::Unauthenticated { problem: "a" }, "UNAUTHENTICATED"),
             (

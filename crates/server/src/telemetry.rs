@@ -9,9 +9,11 @@ use std::time::Duration;
 
 use http::{HeaderMap, HeaderName, HeaderValue, Request, Response};
 use tower_http::request_id::{MakeRequestId, RequestId};
-use tracing::{Span, field};
+use tracing::{Level, Span, field};
 
 use super::connections::Peer;
+use super::health::{HEALTH_CHECK, HEALTH_WATCH};
+use super::rpcs::rpc;
 
 /// The metadata key of the request id, in requests and responses.
 pub const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
@@ -46,25 +48,39 @@ impl MakeRequestId for RandomId {
 /// Maximum length of a path in logs and spans, bytes. Those of RPCs are shorter.
 const LONGEST_PATH: usize = 100;
 
-/// The span of a request. Its status is recorded later.
+/// A span of this level, with the fields of a request.
+macro_rules! request_span {
+    ($level:expr, $request:expr, $path:expr) => {{
+        let id = $request.headers().get(REQUEST_ID);
+        let peer = $request.extensions().get::<Peer>();
+        tracing::span!(
+            $level,
+            "request",
+            id = id.and_then(|id| id.to_str().ok()).unwrap_or_default(),
+            method = $path,
+            trace = trace_id($request.headers()),
+            peer = peer.map(|peer| field::display(peer.address)),
+            principal = field::Empty,
+            grpc_status = field::Empty,
+            // Recorded only where spans are exported; log lines then have them too.
+            otel.name = field::Empty,
+            otel.kind = field::Empty,
+        )
+    }};
+}
+
+/// The span of a request. Its status is recorded later. Everybody can make health calls and calls of
+/// unknown paths, in any number, so they are logged at a lower level.
 pub fn span<B>(request: &Request<B>) -> Span {
-    let id = request.headers().get(REQUEST_ID);
-    let peer = request.extensions().get::<Peer>();
     // An unknown path may be long.
     let path = request.uri().path();
     let path = path.get(..LONGEST_PATH).unwrap_or(path);
-    let span = tracing::info_span!(
-        "request",
-        id = id.and_then(|id| id.to_str().ok()).unwrap_or_default(),
-        method = path,
-        trace = trace_id(request.headers()),
-        peer = peer.map(|peer| field::display(peer.address)),
-        principal = field::Empty,
-        grpc_status = field::Empty,
-        // Recorded only where spans are exported; log lines then have them too.
-        otel.name = field::Empty,
-        otel.kind = field::Empty,
-    );
+    let is_quiet = rpc(path).is_none() || [HEALTH_CHECK, HEALTH_WATCH].contains(&path);
+    let span = if is_quiet {
+        request_span!(Level::DEBUG, request, path)
+    } else {
+        request_span!(Level::INFO, request, path)
+    };
 
     #[cfg(feature = "otlp")]
     super::traces::continue_trace(&span, path, request.headers());

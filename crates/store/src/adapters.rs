@@ -10,7 +10,9 @@ use super::format::{AdapterBody, FittedEntry, TrainingEntry};
 use super::manifest::{self, ObjectRef, SCHEMA};
 use super::publication::Publication;
 use super::stored_adapter::{RoomFit, StoredAdapter};
-use super::{ATTEMPTS, Defaults, Error, Kind, Published, Store, folder_of, revision_path};
+use super::{
+    ATTEMPTS, Defaults, Error, Kind, Published, Store, folder_of, gone_name, revision_path,
+};
 use seese3_core::adapter::{Adapter, TrainingRecord};
 use seese3_core::room::is_plain_name;
 use seese3_robot::fitting::Fitted;
@@ -125,12 +127,22 @@ impl Store {
     ) -> Result<Published, Error> {
         let folder = folder_of(Kind::Adapter, name);
 
-        let publication = Publication::begin(&self.clock);
+        let body = AdapterBody {
+            adapter: name.to_owned(),
+            ..body
+        };
+        let publication = Publication::begin(self, body.owner()).await?;
 
         // Write the weights before the manifest that makes them visible.
         let content = weights;
         let weights = self
-            .write_object(&folder, "weights", "safetensors", content.clone())
+            .write_object(
+                &publication,
+                &folder,
+                "weights",
+                "safetensors",
+                content.clone(),
+            )
             .await?;
 
         // As for rooms: try to create the next revision, and retry if another publisher was faster.
@@ -142,29 +154,18 @@ impl Store {
             };
 
             let body = AdapterBody {
-                adapter: name.to_owned(),
                 revision: numbers.highest + 1,
                 created: chrono::Utc::now().to_rfc3339(),
                 weights: weights.clone(),
                 ..body.clone()
             };
 
-            // Do not publish again if only the revision number and the date differ.
-            if let Some(newest) = newest {
-                let same = AdapterBody {
-                    revision: newest.revision,
-                    created: newest.created.clone(),
-                    ..body.clone()
-                };
-
-                if as_json(&same)? == as_json(&newest)? {
-                    let manifest = revision_path(&folder, newest.revision).to_string();
-                    return Ok(Published {
-                        revision: newest.revision,
-                        is_new: false,
-                        manifest,
-                    });
+            if let Some(unchanged) = unchanged(&folder, &body, newest.as_ref())? {
+                // At a quota, a missing object was not written again.
+                if self.lacks(&folder, body.objects()).await? {
+                    publication.check(&unchanged.manifest)?;
                 }
+                return Ok(unchanged);
             }
 
             let manifest = revision_path(&folder, body.revision).to_string();
@@ -180,7 +181,7 @@ impl Store {
                 // From now on the manifest protects its object from garbage collection. An object
                 // collected before is written again.
                 if self.lacks(&folder, body.objects()).await? {
-                    self.write_object(&folder, "weights", "safetensors", content)
+                    self.write_object(&publication, &folder, "weights", "safetensors", content)
                         .await?;
                 }
                 return Ok(Published {
@@ -258,6 +259,48 @@ impl Store {
         Ok((manifest, weights))
     }
 
+    /// The room that an adapter belongs to: its newest revision is fitted to the room, and its name
+    /// is `ROOM.NAME`. `None` if it belongs to no room, or is not in the store.
+    ///
+    /// # Errors
+    /// [`Error::Damaged`] if its newest manifest is truncated or altered, [`Error::Schema`] if a
+    /// newer program wrote it, [`Error::Io`] if the store cannot be read.
+    pub async fn owner_of(&self, adapter: &str) -> Result<Option<String>, Error> {
+        let newest = self.newest_adapter(adapter).await?;
+        Ok(newest.and_then(|body| body.owner().map(str::to_owned)))
+    }
+
+    /// The manifest of an adapter's highest revision, also if that was removed. Removing a revision
+    /// keeps its manifest until the garbage is collected.
+    pub(super) async fn last_adapter(&self, name: &str) -> Result<Option<AdapterBody>, Error> {
+        let folder = folder_of(Kind::Adapter, name);
+        let numbers = self.revisions(&folder).await?;
+        if !numbers.present.is_empty() {
+            return self.newest_adapter(name).await;
+        }
+
+        let gone = folder.join("revisions").join(gone_name(numbers.highest));
+        match self.read(&gone).await {
+            Ok(bytes) => Ok(Some(manifest::decode(&self.shown(&gone), &bytes)?)),
+            Err(Error::Absent { .. }) => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// The manifest of an adapter's newest revision, if there is one.
+    pub(super) async fn newest_adapter(&self, name: &str) -> Result<Option<AdapterBody>, Error> {
+        let folder = folder_of(Kind::Adapter, name);
+        let Some(&newest) = self.revisions(&folder).await?.present.last() else {
+            return Ok(None);
+        };
+        match self.adapter_body(&folder, newest).await {
+            Ok(body) => Ok(Some(body)),
+            // It was removed meanwhile.
+            Err(Error::Absent { .. }) => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
     /// The names of all adapters, sorted.
     ///
     /// # Errors
@@ -287,6 +330,29 @@ impl Store {
 
         Ok(body)
     }
+}
+
+/// The newest revision, if it equals `body` except for the revision number and the date.
+fn unchanged(
+    folder: &Path,
+    body: &AdapterBody,
+    newest: Option<&AdapterBody>,
+) -> Result<Option<Published>, Error> {
+    let Some(newest) = newest else {
+        return Ok(None);
+    };
+    let same = AdapterBody {
+        revision: newest.revision,
+        created: newest.created.clone(),
+        ..body.clone()
+    };
+
+    let is_same = as_json(&same)? == as_json(newest)?;
+    Ok(is_same.then(|| Published {
+        revision: newest.revision,
+        is_new: false,
+        manifest: revision_path(folder, newest.revision).to_string(),
+    }))
 }
 
 /// A body as it is stored. Undefined scores are NaN in memory and null here, where they are equal.

@@ -1,5 +1,7 @@
 //! Listing of a store's contents, by revision.
 
+use std::ops::AddAssign;
+
 use strum::VariantArray;
 use tokio_stream::StreamExt;
 
@@ -50,6 +52,13 @@ pub struct Usage {
     /// Size of all files, bytes; those of removed revisions count until they are collected as
     /// garbage.
     pub bytes: u64,
+}
+
+impl AddAssign for Usage {
+    fn add_assign(&mut self, other: Self) {
+        self.revisions += other.revisions;
+        self.bytes += other.bytes;
+    }
 }
 
 impl Store {

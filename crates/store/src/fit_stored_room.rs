@@ -27,6 +27,11 @@ pub enum Error {
     Name { name: String },
     #[error("the name '{name}' is taken by an adapter that was not fitted to room '{room}'")]
     Taken { name: String, room: String },
+    #[error(
+        "a caller without access to all rooms can only name the adapter '{room}.NAME', where NAME \
+         has no dot, or give no name"
+    )]
+    OtherRooms { room: String },
 }
 
 /// Inputs of a fit.
@@ -39,8 +44,12 @@ pub struct Request {
     pub base: Option<String>,
     /// The feature set; if `None`, that of the base, or else the room's only one.
     pub features: Option<String>,
-    /// Name of the fitted adapter; `ROOM.FEATURES.fitted` if `None`.
+    /// Name of the fitted adapter. If `None`, `ROOM.FEATURES.fitted`, or `ROOM.FEATURES-fitted` if
+    /// another adapter has that name.
     pub name: Option<String>,
+    /// Whether only names that are reserved for the room's adapters, and the default name, are
+    /// accepted.
+    pub own_names_only: bool,
     /// Seed of the sampled pairs, the noise and, without a base, the initial weights.
     pub seed: u64,
 }
@@ -52,6 +61,8 @@ pub struct Refit {
     features: Features,
     base: Option<StoredAdapter>,
     name: String,
+    /// Whether the caller gave no name.
+    is_default_name: bool,
     seed: u64,
 }
 
@@ -60,8 +71,8 @@ impl Refit {
     ///
     /// # Errors
     /// [`Error::Base`] if the base was trained on the room, since its errors there would be
-    /// underestimated, or was fitted to any room; [`Error::Name`] or [`Error::Taken`] if the name
-    /// cannot be published; [`Error::Store`] if the room, its features or the base cannot be read.
+    /// underestimated, or was fitted to any room; [`Error::Name`], [`Error::Taken`] or
+    /// [`Error::OtherRooms`] if the name cannot be published; [`Error::Store`] if the room, its features or the base cannot be read.
     pub async fn prepare(store: &Store, request: Request) -> Result<Self, Error> {
         let base = match &request.base {
             Some(name) => Some(store.load_adapter(name, None).await?),
@@ -79,17 +90,49 @@ impl Refit {
             .load_room_with(&request.room, wanted.as_deref())
             .await?;
 
-        let default_name = || format!("{}.{}.fitted", request.room, features.source().name);
-        let name = request.name.unwrap_or_else(default_name);
-        check_name(store, &name, stored.room.id()).await?;
+        let room = &request.room;
+        let default_name = format!("{room}.{}.fitted", features.source().name);
+        if let Some(name) = &request.name
+            && request.own_names_only
+            && *name != default_name
+            && !is_own_name(name, room)
+        {
+            return Err(Error::OtherRooms { room: request.room });
+        }
 
-        Ok(Self {
+        let mut refit = Self {
             stored,
             features,
             base,
-            name,
+            is_default_name: request.name.is_none(),
+            name: request.name.unwrap_or(default_name),
             seed: request.seed,
-        })
+        };
+        refit.choose_name(store).await?;
+        Ok(refit)
+    }
+
+    /// Checks the name. Replaces the default name if another adapter has it.
+    async fn choose_name(&mut self, store: &Store) -> Result<(), Error> {
+        let room = self.stored.room.id();
+        if !self.is_default_name {
+            return check_name(store, &self.name, room).await;
+        }
+
+        // Room `a` with features `b.f` has the same default name as room `a.b` with features `f`.
+        let features = self.features.source().name.replace('.', "-");
+        let reserved = format!("{room}.{features}-fitted");
+        let owner = store.owner_of(&reserved).await;
+        let is_ours = owner.is_ok_and(|owner| owner.as_deref() == Some(room.as_str()));
+        match check_name(store, &self.name, room).await {
+            Ok(()) if !is_ours => Ok(()),
+            Ok(()) | Err(Error::Taken { .. }) => {
+                check_name(store, &reserved, room).await?;
+                self.name = reserved;
+                Ok(())
+            }
+            Err(error) => Err(error),
+        }
     }
 
     /// Name under which the fitted adapter is published.
@@ -128,12 +171,12 @@ impl Refit {
         Ok(fitted)
     }
 
-    /// Publishes the fitted adapter.
+    /// Publishes the fitted adapter under [`Refit::name`], which may have changed.
     ///
     /// # Errors
     /// [`Error::Taken`] if the name was taken meanwhile, [`Error::Store`] if the store cannot be
     /// written.
-    pub async fn publish(&self, store: &Store, fitted: &Fitted) -> Result<Published, Error> {
+    pub async fn publish(&mut self, store: &Store, fitted: &Fitted) -> Result<Published, Error> {
         let room_fit = RoomFit {
             room: self.stored.room.id().clone(),
             room_revision: self.stored.revision,
@@ -145,7 +188,7 @@ impl Refit {
         };
 
         // The fit takes minutes, and the name may have been taken meanwhile.
-        check_name(store, &self.name, self.stored.room.id()).await?;
+        self.choose_name(store).await?;
 
         let features = self.features.rows();
         Ok(store
@@ -170,6 +213,14 @@ fn check_base(base: &StoredAdapter, room: &str) -> Result<(), Error> {
     Ok(())
 }
 
+/// Whether an adapter's name is `ROOM.NAME` without a further dot. A name with one could belong to a
+/// room with a dotted name.
+fn is_own_name(adapter: &str, room: &str) -> bool {
+    let rest = adapter.strip_prefix(room);
+    let rest = rest.and_then(|rest| rest.strip_prefix('.'));
+    rest.is_some_and(|rest| !rest.is_empty() && !rest.contains('.'))
+}
+
 /// Checks, before the fit starts, that the name is valid and not taken by an adapter that was not
 /// fitted to this room.
 async fn check_name(store: &Store, name: &str, room: &RoomId) -> Result<(), Error> {
@@ -178,18 +229,20 @@ async fn check_name(store: &Store, name: &str, room: &RoomId) -> Result<(), Erro
             name: name.to_owned(),
         });
     }
+    let taken = || Error::Taken {
+        name: name.to_owned(),
+        room: room.to_string(),
+    };
 
-    let known = store.adapter_names().await?;
-    if known.iter().any(|known| known == name) {
-        let newest = store.load_adapter(name, None).await?;
-        let is_of_this_room = newest.room_fit.is_some_and(|fit| fit.room == *room);
-        if !is_of_this_room {
-            return Err(Error::Taken {
-                name: name.to_owned(),
-                room: room.to_string(),
-            });
-        }
+    let newest = match store.newest_adapter(name).await {
+        Ok(newest) => newest,
+        // What it was is unknown, so it may be another room's.
+        Err(crate::Error::Damaged { .. } | crate::Error::Schema { .. }) => return Err(taken()),
+        Err(error) => return Err(error.into()),
+    };
+    match newest.map(|body| body.fitted_to.map(|fit| fit.room)) {
+        None => Ok(()),
+        Some(Some(fitted_to)) if fitted_to == room.as_str() => Ok(()),
+        Some(_) => Err(taken()),
     }
-
-    Ok(())
 }

@@ -87,6 +87,14 @@ pub struct AdapterBody {
 }
 
 impl AdapterBody {
+    /// The room that the adapter belongs to: it is fitted to it, and its name begins with the
+    /// room's.
+    pub fn owner(&self) -> Option<&str> {
+        let room = self.fitted_to.as_ref()?.room.as_str();
+        let rest = self.adapter.strip_prefix(room)?;
+        rest.starts_with('.').then_some(room)
+    }
+
     /// All objects of the revision.
     pub fn objects(&self) -> impl Iterator<Item = &ObjectRef> {
         std::iter::once(&self.weights)

@@ -50,6 +50,7 @@ mod verification;
 mod contents;
 mod garbage;
 mod removal;
+mod quota;
 mod room_fit;
 mod rooms;
 mod room_publishing;
@@ -66,6 +67,7 @@ pub use extension::{ExtendedRoom, OtherFeatures};
 pub use garbage::{Garbage, GarbageFile, GarbagePolicy, Publishers};
 pub use map_edits::EditedRoom;
 pub use publication::{Clock, GRACE, LONGEST_PUBLICATION};
+pub use quota::{Quota, Quotas, Scope};
 pub use removal::Removed;
 pub use resource::{Kind, ResourceName, ResourceNameError};
 pub use room_keypoints::{HeaderError, KeypointsHeader, RoomKeypoints};
@@ -118,6 +120,11 @@ pub enum Error {
         GRACE.as_secs() / 60
     )]
     Grace,
+    #[error(
+        "{used}; delete revisions that are not needed, or ask the operator for a larger quota; bytes \
+         are free again after garbage collection"
+    )]
+    Quota { used: String },
     #[error("{kind} '{name}' has no revision {revision}; its newest is {newest}")]
     UnknownRevision {
         kind: &'static str,
@@ -245,6 +252,8 @@ pub struct Store {
     folder: Option<PathBuf>,
     /// Measures how long publications take.
     clock: Clock,
+    /// Limits of publications.
+    quotas: Arc<Quotas>,
 }
 
 /// The numbers of the files in a folder of numbered files, such as `revisions/`.
@@ -296,6 +305,7 @@ impl Store {
                 location: location.to_owned(),
                 folder: None,
                 clock: Clock::default(),
+                quotas: Arc::default(),
             });
         }
 
@@ -317,6 +327,7 @@ impl Store {
             location: location.to_owned(),
             folder: Some(PathBuf::from(location)),
             clock: Clock::default(),
+            quotas: Arc::default(),
         })
     }
 
@@ -327,6 +338,7 @@ impl Store {
             location: location.to_owned(),
             folder: None,
             clock: Clock::default(),
+            quotas: Arc::default(),
         }
     }
 
@@ -424,9 +436,10 @@ impl Store {
     }
 
     /// Writes an object under a name that contains the hash of its content, so that writing the
-    /// same content twice is harmless.
+    /// same content twice is harmless. Writes nothing if a quota is reached.
     async fn write_object(
         &self,
+        publication: &Publication,
         folder: &Path,
         stem: &str,
         extension: &str,
@@ -440,8 +453,10 @@ impl Store {
         let path = folder.clone().join("objects").join(file.as_str());
         let size = bytes.len() as u64;
 
-        let written = self.objects.put(&path, PutPayload::from(bytes)).await;
-        written.map_err(|error| self.io(&path, error))?;
+        if publication.may_write() {
+            let written = self.objects.put(&path, PutPayload::from(bytes)).await;
+            written.map_err(|error| self.io(&path, error))?;
+        }
 
         Ok(manifest::ObjectRef {
             file,
@@ -474,8 +489,7 @@ impl Store {
     /// exists now.
     ///
     /// # Errors
-    /// [`Error::TooSlow`] if the publication has taken too long; [`Error::Io`] if the store cannot
-    /// be written.
+    /// As [`Publication::check`]; [`Error::Io`] if the store cannot be written.
     async fn write_manifest(
         &self,
         publication: &Publication,

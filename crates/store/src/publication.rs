@@ -1,4 +1,7 @@
-//! Time limit of publications.
+//! Conditions of publications: quotas and a time limit.
+//!
+//! When a quota is reached, a publication writes nothing. It still succeeds if the newest revision has
+//! the same content.
 //!
 //! A publication writes its objects first and its manifest last. Until then no manifest references
 //! the objects, and only their age protects them from garbage collection. Two limits together make
@@ -13,7 +16,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::Error;
+use super::{Error, Store};
 
 /// Minimum age of files that garbage collection removes.
 pub const GRACE: Duration = Duration::from_secs(3_600);
@@ -53,22 +56,44 @@ impl fmt::Debug for Clock {
 pub(super) struct Publication {
     clock: Clock,
     began: Duration,
+    /// The quota that is reached, if one is.
+    quota: Option<String>,
 }
 
 impl Publication {
-    /// Begins a publication. Everything that its manifest references is read or written later.
-    pub fn begin(clock: &Clock) -> Self {
-        Self {
-            clock: clock.clone(),
-            began: clock.elapsed(),
-        }
-    }
-
-    /// Checks that the manifest may still be written.
+    /// Begins a publication of a room, or of an adapter that belongs to it. Everything that its
+    /// manifest references is read or written later.
     ///
     /// # Errors
-    /// [`Error::TooSlow`] after [`LONGEST_PUBLICATION`].
+    /// [`Error::Io`] if the store's usage cannot be read.
+    pub async fn begin(store: &Store, room: Option<&str>) -> Result<Self, Error> {
+        let began = store.clock.elapsed();
+        let quota = match store.check_quotas(room).await {
+            Ok(()) => None,
+            Err(Error::Quota { used }) => Some(used),
+            Err(error) => return Err(error),
+        };
+
+        Ok(Self {
+            clock: store.clock.clone(),
+            began,
+            quota,
+        })
+    }
+
+    /// Whether objects may be written.
+    pub fn may_write(&self) -> bool {
+        self.quota.is_none()
+    }
+
+    /// Checks that the manifest may be written.
+    ///
+    /// # Errors
+    /// [`Error::Quota`] at a quota, [`Error::TooSlow`] after [`LONGEST_PUBLICATION`].
     pub fn check(&self, manifest: &str) -> Result<(), Error> {
+        if let Some(used) = &self.quota {
+            return Err(Error::Quota { used: used.clone() });
+        }
         if self.clock.elapsed() - self.began <= LONGEST_PUBLICATION {
             return Ok(());
         }

@@ -193,7 +193,7 @@ impl Store {
         }
 
         for _ in 0..ATTEMPTS {
-            let publication = Publication::begin(&self.clock);
+            let publication = Publication::begin(self, Some(name)).await?;
             let (folder, revision) = self.resolve(Kind::Room, name, None).await?;
             let newest = self.room_body(&folder, revision).await?;
             let numbers = self.revisions(&folder).await?;
@@ -252,7 +252,7 @@ impl Store {
         check_features(room, features)?;
         check_keypoints(room, keypoints)?;
         let folder = folder_of(Kind::Room, room.id().as_str());
-        let publication = Publication::begin(&self.clock);
+        let publication = Publication::begin(self, Some(room.id().as_str())).await?;
 
         // A repeated import, for instance without images, must not lose stored data: missing
         // columns are filled in from the newest revision.
@@ -262,7 +262,7 @@ impl Store {
         // All objects are written before the manifest that references them. After an interruption
         // they are unreferenced.
         let objects = self
-            .write_objects(&folder, contents, known.as_ref())
+            .write_objects(&publication, &folder, contents, known.as_ref())
             .await?;
 
         // Optimistic concurrency: build the manifest on the newest revision and try to create the
@@ -296,6 +296,10 @@ impl Store {
                 .sort_by(|a, b| a.source.name.cmp(&b.source.name));
 
             if let Some(unchanged) = unchanged(&folder, &body, newest) {
+                // At a quota, a missing object was not written again.
+                if self.lacks(&folder, body.objects()).await? {
+                    publication.check(&unchanged.manifest)?;
+                }
                 return Ok(unchanged);
             }
 
@@ -310,7 +314,7 @@ impl Store {
                 .await?
             {
                 if !self
-                    .confirm(&folder, &body, contents, known.as_ref())
+                    .confirm(&publication, &body, contents, known.as_ref())
                     .await?
                 {
                     continue;
@@ -361,15 +365,17 @@ impl Store {
     /// be: then the manifest is removed, and the result is false.
     async fn confirm(
         &self,
-        folder: &Path,
+        publication: &Publication,
         body: &RoomBody,
         contents: RoomContents<'_>,
         known_frames: Option<&ObjectRef>,
     ) -> Result<bool, Error> {
+        let folder = &folder_of(Kind::Room, &body.room);
         if !self.lacks(folder, body.objects()).await? {
             return Ok(true);
         }
-        self.write_objects(folder, contents, known_frames).await?;
+        self.write_objects(publication, folder, contents, known_frames)
+            .await?;
         if !self.lacks(folder, body.objects()).await? {
             return Ok(true);
         }
@@ -382,6 +388,7 @@ impl Store {
     /// it can be reused.
     async fn write_objects(
         &self,
+        publication: &Publication,
         folder: &Path,
         contents: RoomContents<'_>,
         known_frames: Option<&ObjectRef>,
@@ -391,26 +398,28 @@ impl Store {
             features,
             keypoints,
         } = contents;
+        let write = async |stem: &str, extension, bytes| {
+            self.write_object(publication, folder, stem, extension, bytes)
+                .await
+        };
+        let write_names = async |stem, names: &[String]| match names {
+            [] => Ok(None),
+            names => write(stem, "json", names_file(names)?).await.map(Some),
+        };
+
         let frames = match known_frames {
             Some(frames) => frames.clone(),
-            None => {
-                self.write_object(folder, "frames", "safetensors", frames_file(room)?)
-                    .await?
-            }
+            None => write("frames", "safetensors", frames_file(room)?).await?,
         };
-        let frame_names = self
-            .write_names(folder, "frame-names", room.frame_names())
-            .await?;
-        let images = self.write_names(folder, "images", room.images()).await?;
+        let frame_names = write_names("frame-names", room.frame_names()).await?;
+        let images = write_names("images", room.images()).await?;
 
         // Each feature set is a separate object, so that later revisions can reference it without
         // copying.
         let mut entries = Vec::with_capacity(features.len());
         for set in features {
             let stem = format!("features-{}", set.source().name);
-            let object = self
-                .write_object(folder, &stem, "safetensors", features_file(set)?)
-                .await?;
+            let object = write(&stem, "safetensors", features_file(set)?).await?;
             entries.push(FeaturesEntry {
                 source: set.source().clone(),
                 object,
@@ -420,10 +429,9 @@ impl Store {
         let keypoints = match keypoints {
             Some(keypoints) => {
                 let bytes = keypoints.to_bytes()?;
-                let object = self.write_object(folder, "keypoints", "safetensors", bytes);
                 Some(KeypointsEntry {
                     header: keypoints.header(),
-                    object: object.await?,
+                    object: write("keypoints", "safetensors", bytes).await?,
                 })
             }
             None => None,
@@ -436,23 +444,6 @@ impl Store {
             features: entries,
             keypoints,
         })
-    }
-
-    /// Writes a list of names, if there are any.
-    async fn write_names(
-        &self,
-        folder: &Path,
-        stem: &str,
-        names: &[String],
-    ) -> Result<Option<ObjectRef>, Error> {
-        if names.is_empty() {
-            return Ok(None);
-        }
-
-        let object = self
-            .write_object(folder, stem, "json", names_file(names)?)
-            .await?;
-        Ok(Some(object))
     }
 
     /// Fills in a room's empty columns from the newest revision, if that has the same poses. Also

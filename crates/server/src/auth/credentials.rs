@@ -15,6 +15,7 @@
 //! external issuers are accepted by `[[issuer]]`, see [`super::issuers`].
 
 use seese3_core::Cause;
+use seese3_store::Quota;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -26,7 +27,6 @@ use subtle::ConstantTimeEq;
 use tokio::sync::watch;
 
 use super::super::Error;
-use super::super::quota::Quota;
 use super::super::slow_files::read_logged_if_slow;
 use super::issuer_form::IssuerForm;
 use super::issuers::Issuer;
@@ -385,6 +385,13 @@ impl Keyring {
     /// The current credentials.
     pub fn current(&self) -> Arc<Credentials> {
         self.current.borrow().clone()
+    }
+
+    /// Whether the principal's rights are unchanged and its token has not expired.
+    pub fn is_valid(&self, principal: &Arc<Principal>) -> bool {
+        let until = principal.signed.as_ref().and_then(|signed| signed.until);
+        let has_expired = until.is_some_and(|until| left(until, SystemTime::now()).is_none());
+        !has_expired && self.current.borrow().holds(principal)
     }
 
     fn replace(&self, credentials: Credentials) {

@@ -164,7 +164,7 @@ impl Issuer {
             return known;
         }
 
-        // Before the map would grow, drop subjects without open requests.
+        // Before the map would grow, drop subjects without requests and connections.
         if subjects.len() == subjects.capacity() {
             subjects.retain(|_, places| places.strong_count() > 0);
         }

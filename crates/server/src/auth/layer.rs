@@ -12,7 +12,7 @@ use tonic::body::Body;
 use tower::{Layer, Service};
 
 use super::super::Error;
-use super::super::connections::Peer;
+use super::super::connections::{Owner, Peer};
 use super::super::health::{HEALTH_CHECK, HEALTH_WATCH};
 use super::super::holding_body::holding;
 use super::super::metrics::Metrics;
@@ -53,6 +53,23 @@ struct Admitted {
     /// Keeps the limits of a signed token's subject alive: they are dropped with its last
     /// principal.
     _principal: Arc<Principal>,
+}
+
+/// The principal of an admitted call, as the owner of its connection.
+#[derive(Debug)]
+struct ConnectionOwner {
+    keyring: Arc<Keyring>,
+    principal: Arc<Principal>,
+}
+
+impl Owner for ConnectionOwner {
+    fn name(&self) -> Arc<str> {
+        self.principal.shared_name()
+    }
+
+    fn is_valid(&self) -> bool {
+        self.keyring.is_valid(&self.principal)
+    }
 }
 
 /// Middleware that admits only authenticated callers, if there are credentials.
@@ -134,9 +151,6 @@ impl AuthLayer {
         };
 
         let principal = caller(keyring, request)?;
-        if let Some(peer) = request.extensions().get::<Peer>() {
-            peer.authenticated();
-        }
         tracing::Span::current().record("principal", principal.name());
 
         // Without credentials, all unknown paths are refused above as unauthenticated.
@@ -155,6 +169,17 @@ impl AuthLayer {
             self.metrics.shed(full);
             Error::Full { what: full }
         })?;
+        if let Some(peer) = request.extensions().get::<Peer>() {
+            let owner = ConnectionOwner {
+                keyring: keyring.clone(),
+                principal: principal.clone(),
+            };
+            if !peer.assign(Arc::new(owner)) {
+                let full = Full::CallersConnections;
+                self.metrics.shed(full);
+                return Err(Error::Full { what: full });
+            }
+        }
         request.extensions_mut().insert(principal.clone());
 
         Ok(Some(Admitted {

@@ -21,8 +21,8 @@ pub use layer::AuthLayer;
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use super::quota::Quota;
 use issuers::Issuer;
+use seese3_store::Quota;
 use serde::Deserialize;
 use strum::IntoStaticStr;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};

@@ -44,19 +44,19 @@ impl Handlers {
             seese3_store::check_adapter_files(&manifest, &weights).map(|_| weights)
         });
         let weights = checked.await.map_err(|_| Error::Internal)?.map_err(unfit)?;
+        let store = changes.store_for(&caller);
         if upload.validate_only {
+            let check = async move { Ok(store.check_quotas(None).await?) };
+            changes.validated(&caller.id, check).await?;
             return Ok(pb::PublishAdapterResponse::default());
         }
 
         let content = upload.encode_to_vec();
         let identity = identity(&caller, &upload.request_id, "PublishAdapter", &content);
-        let store = changes.store.clone();
         let published_as = name.name.clone();
-        let quotas = changes.quotas(&caller);
         let change = async move {
             // Uploaded data counts toward the limit until it is stored.
             let _memory = memory;
-            quotas.check_caller().await?;
             store
                 .publish_adapter_files(&name.name, &upload.manifest, weights)
                 .await

@@ -12,7 +12,6 @@ use tracing::Instrument;
 
 use super::super::caller::{CallerId, Requester};
 use super::super::metrics::Metrics;
-use super::super::quota::Quota;
 use super::super::reload::ReloadHandle;
 use super::super::shares::{Exhausted, Share, Shares};
 use super::super::snapshot::Snapshot;
@@ -21,7 +20,7 @@ use super::super::{Config, Error, Handlers, Phase};
 use super::recent::{Identity, Recent};
 use seese3_client::proto::v1 as pb;
 use seese3_store::fit_stored_room;
-use seese3_store::{Kind, Published, ResourceName, Store};
+use seese3_store::{Kind, Published, Quota, Quotas, ResourceName, Scope, Store};
 
 /// Maximum length of free-text fields, characters.
 const LONGEST_WORDS: usize = 1_000;
@@ -32,7 +31,7 @@ const MOST_WAITING: usize = 64;
 pub struct Changes {
     pub store: Store,
     /// What may be stored of each room.
-    pub quota: Quota,
+    quota: Quota,
     reload: ReloadHandle,
     recent: Arc<Mutex<Recent>>,
     /// Places of queued and running changes.
@@ -56,6 +55,16 @@ impl Changes {
             fits: Arc::default(),
             metrics: config.metrics.clone(),
         }
+    }
+
+    /// The store, whose publications are checked against the caller's quotas.
+    pub fn store_for(&self, caller: &Requester) -> Store {
+        let scope = caller.scope().filter(|scope| !scope.is_all()).cloned();
+        self.store.with_quotas(Quotas {
+            room: self.quota,
+            caller: caller.quota(),
+            scope: scope.map(|scope| Arc::new(move |room: &str| scope.contains(room)) as Scope),
+        })
     }
 
     /// Makes a change at most once per request id. Waits for its turn; returns the stored response
@@ -371,6 +380,9 @@ impl From<seese3_store::Error> for Error {
                 name: format!("{name}/revisions/{revision}"),
             },
             E::UnknownFeatures { .. } | E::WhichFeatures { .. } => Self::invalid("features", error),
+            E::Quota { .. } => Self::Quota {
+                problem: error.to_string(),
+            },
             E::InUse { .. } | E::NothingToTakeBack => Self::Precondition(error.to_string()),
             E::Contended { name } => Self::Conflict {
                 name: name.clone(),
@@ -401,7 +413,9 @@ impl From<fit_stored_room::Error> for Error {
         match error {
             E::Store(error) => error.into(),
             E::Base { .. } => Self::invalid("base_adapter", error),
-            E::Name { .. } | E::Taken { .. } => Self::invalid("fitted_adapter", error),
+            E::Name { .. } | E::Taken { .. } | E::OtherRooms { .. } => {
+                Self::invalid("fitted_adapter", error)
+            }
             E::Fitting(_) => Self::Precondition(error.to_string()),
         }
     }

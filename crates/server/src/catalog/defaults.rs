@@ -111,7 +111,8 @@ impl Handlers {
         check_right(&caller, &resource)?;
 
         let answer = |revisions| pb::DeleteRoomResponse { revisions };
-        self.delete(identity, resource, request.validate_only, answer)
+        let right = std::future::ready(Ok(()));
+        self.delete(identity, resource, request.validate_only, right, answer)
             .await
     }
 
@@ -123,28 +124,50 @@ impl Handlers {
         let content = request.encode_to_vec();
         let identity = identity(&caller, &request.request_id, "DeleteAdapter", &content);
         let resource = named("name", &request.name, Kind::Adapter)?;
-        check_right(&caller, &resource)?;
+        let store = self.changes()?.store.clone();
+        let adapter = resource.clone();
+        let right = async move {
+            let Err(error) = check_right(&caller, &adapter) else {
+                return Ok(());
+            };
+            // A caller may delete the adapters of its own rooms.
+            let owner = store.owner_of(&adapter.name).await?;
+            let room = owner.map(ResourceName::room);
+            match room.map(|room| check_right(&caller, &room)) {
+                Some(Ok(())) => Ok(()),
+                _ => Err(error),
+            }
+        };
 
         let answer = |revisions| pb::DeleteAdapterResponse { revisions };
-        self.delete(identity, resource, request.validate_only, answer)
+        self.delete(identity, resource, request.validate_only, right, answer)
             .await
     }
 
+    /// Deletes a room or an adapter. `right` checks the caller's right when the change has its turn,
+    /// so that no other change comes between.
     async fn delete<A: Message + Default + 'static>(
         &self,
         identity: Identity,
         resource: ResourceName,
         validate_only: bool,
+        right: impl Future<Output = Result<(), Error>> + Send + 'static,
         answer: impl Fn(Vec<u64>) -> A + Send + 'static,
     ) -> Result<A, Error> {
         let changes = self.changes()?.clone();
         let store = changes.store.clone();
         if validate_only {
-            let check = async move { Ok(store.check_removable(&resource).await?.revisions) };
+            let check = async move {
+                right.await?;
+                Ok(store.check_removable(&resource).await?.revisions)
+            };
             return Ok(answer(changes.validated(&identity.charged, check).await?));
         }
 
-        let change = async move { Ok(store.remove(&resource).await?.revisions) };
+        let change = async move {
+            right.await?;
+            Ok(store.remove(&resource).await?.revisions)
+        };
         changes.once(identity, change, answer).await
     }
 }

@@ -4,7 +4,6 @@
 //! | --- | --- |
 //! | `changes` | common steps of all changes: one at a time, reload of the store, stored responses |
 //! | `recent` | stored responses to recent changes, for idempotent retries |
-//! | `quotas` | limits on what rooms and callers may have in the store |
 //! | `keypoints_upload` | the keypoints of an uploaded room |
 //! | `room_upload` | uploads a room, in batches of frames |
 //! | `adapter_upload` | uploads an adapter |
@@ -17,7 +16,6 @@ mod changes;
 mod defaults;
 mod frames;
 mod keypoints_upload;
-mod quotas;
 mod recent;
 mod refits;
 mod room_upload;

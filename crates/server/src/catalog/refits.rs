@@ -8,18 +8,16 @@ use prost::Message;
 use tokio::sync::mpsc;
 use tonic::Status;
 
-use super::super::auth::RoomScope;
 use super::super::caller::Requester;
 use super::super::workers::{CallContext, Lane};
 use super::super::{Error, Handlers};
 use super::changes::{check_right, identity, named_whole, revision_to_wire};
-use super::quotas::{Quotas, owner};
 use super::recent::Identity;
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
 use seese3_robot::fitting::{FITTING_EPOCHS, FitRun};
 use seese3_store::fit_stored_room::{Refit, Request};
-use seese3_store::{Kind, Published};
+use seese3_store::{Kind, Published, Store};
 
 /// Sender of a fit's events.
 pub type Events = mpsc::Sender<Result<pb::RefitRoomResponse, Status>>;
@@ -32,9 +30,8 @@ pub struct Admitted {
     request: Request,
     identity: Identity,
     validate_only: bool,
-    quotas: Quotas,
-    /// Whether the adapter's name must be one of the room's.
-    is_scoped: bool,
+    /// The store with the caller's quotas.
+    store: Store,
 }
 
 impl Handlers {
@@ -85,16 +82,10 @@ impl Handlers {
             seen.map_err(|error| error.named("base_adapter"))?;
         }
 
-        let sees_all = caller.scope().is_none_or(RoomScope::is_all);
-        if let Some(name) = &fitted_adapter
-            && !sees_all
-        {
-            self.check_namespace(name, &room.name)?;
-        }
-
         let request = Request {
             base,
             name: fitted_adapter,
+            own_names_only: caller.scope().is_some_and(|scope| !scope.is_all()),
             features: (!features.is_empty()).then_some(features),
             room: room.name,
             seed,
@@ -104,26 +95,8 @@ impl Handlers {
             request,
             identity,
             validate_only,
-            quotas: self.changes()?.quotas(caller),
-            is_scoped: !sees_all,
+            store: self.changes()?.store_for(caller),
         })
-    }
-
-    /// Checks that a fitted adapter is named after its room, and not after another room whose name
-    /// is longer.
-    ///
-    /// # Errors
-    /// [`Error::Invalid`] if not.
-    fn check_namespace(&self, adapter: &str, room: &str) -> Result<(), Error> {
-        let snapshot = self.snapshot_for(None)?;
-        if owner(adapter, snapshot.rooms().keys()) == Some(room) {
-            return Ok(());
-        }
-        let problem = format!(
-            "must be '{room}.NAME' for a caller without access to all rooms, and must not begin with the name of \
-             another room"
-        );
-        Err(Error::invalid("fitted_adapter", problem))
     }
 
     /// Fits, publishes and sends the result. Stops the fit if the caller disconnects before it is
@@ -163,8 +136,7 @@ impl Handlers {
             request,
             identity,
             validate_only,
-            quotas,
-            is_scoped,
+            store,
         } = admitted;
         let changes = self.changes()?.clone();
         if let Some(answer) = changes.answered(&identity).await? {
@@ -182,18 +154,13 @@ impl Handlers {
             ..context
         };
         let room = request.room.clone();
-        let store = changes.store.clone();
-        let of_room = room.clone();
-        let handlers = self.clone();
+        let read = store.clone();
         let runtime = tokio::runtime::Handle::current();
         let fit = move |cancel: &Cancellation| {
             // Before the work, so that it is not lost.
-            runtime.block_on(quotas.check(&of_room))?;
+            runtime.block_on(read.check_quotas(Some(&request.room)))?;
             // The room is read when the fit's turn has come, so that queued fits hold no memory.
-            let refit = runtime.block_on(Refit::prepare(&store, request))?;
-            if is_scoped {
-                handlers.check_namespace(refit.name(), &of_room)?;
-            }
+            let refit = runtime.block_on(Refit::prepare(&read, request))?;
             if validate_only {
                 return Ok((refit, None));
             }
@@ -203,19 +170,18 @@ impl Handlers {
             })?;
             Ok((refit, Some(fitted)))
         };
-        let (refit, fitted) = self.workers.run(Lane::Fit, context, fit).await?;
+        let (mut refit, fitted) = self.workers.run(Lane::Fit, context, fit).await?;
         let Some(fitted) = fitted else {
             return Ok(pb::RefitResult::default());
         };
 
-        let store = changes.store.clone();
-        let name = refit.name().to_owned();
         let change = async move {
             let _place = place;
-            Ok(refit.publish(&store, &fitted).await?)
+            let published = refit.publish(&store, &fitted).await?;
+            Ok((refit.name().to_owned(), published))
         };
         let handlers = self.clone();
-        let answer = move |published: Published| {
+        let answer = move |(name, published): (String, Published)| {
             let revision = revision_to_wire(&name, &published);
             pb::RefitResult {
                 served: handlers.serves_in(&room, &revision),

@@ -14,7 +14,9 @@ use super::super::shares::Share;
 use super::super::snapshot::Snapshot;
 use super::super::workers::Lane;
 use super::super::{Error, Handlers, convert};
-use super::changes::{Changes, check_length, check_right, identity, named_whole, revision_to_wire};
+use super::changes::{
+    Changes, check_length, check_right, identity, named_whole, on_blocking_thread, revision_to_wire,
+};
 use super::keypoints_upload::ReceivedKeypoints;
 use seese3_client::proto::v1 as pb;
 use seese3_core::features::{FeatureSource, Features, MAX_COLUMNS, UNSPECIFIED};
@@ -118,8 +120,8 @@ impl Handlers {
             received.memory.push(memory.await?);
         }
 
-        let end = self
-            .receive_frames(&mut received, &snapshot, &mut messages)
+        let (mut received, end) = self
+            .receive_frames(received, &snapshot, &mut messages)
             .await?;
         expect_end(&mut messages).await?;
 
@@ -130,35 +132,39 @@ impl Handlers {
 
         let name = received.name.name.clone();
         let memory = std::mem::take(&mut received.memory);
-        let uploaded = finished(received, &upload, &end)?;
-        for warning in check_room(&uploaded.room, None).warnings {
-            tracing::warn!(room = name, %warning, "the poses of an uploaded room look wrong");
-        }
+        let (described, of_room) = (upload.clone(), name.clone());
+        let uploaded = on_blocking_thread(async move {
+            let uploaded = finished(received, &described, &end)?;
+            for warning in check_room(&uploaded.room, None).warnings {
+                tracing::warn!(room = of_room, %warning, "the poses of an uploaded room look wrong");
+            }
+            Ok::<_, Error>(uploaded)
+        });
+        let uploaded = uploaded.await??;
         let others = if upload.drop_other_features {
             OtherFeatures::LeftBehind
         } else {
             OtherFeatures::Required
         };
 
-        let store = changes.store.clone();
+        let store = changes.store_for(&caller);
+        let room = name.clone();
         if upload.validate_only {
-            if upload.extend {
-                let check = async move {
-                    let extended = store.extended_room(uploaded.contents(), others).await;
-                    Ok(extended.map(drop)?)
-                };
-                changes.validated(&caller.id, check).await?;
-            }
+            let check = async move {
+                store.check_quotas(Some(&room)).await?;
+                if upload.extend {
+                    store.extended_room(uploaded.contents(), others).await?;
+                }
+                Ok(())
+            };
+            changes.validated(&caller.id, check).await?;
             return Ok(pb::CreateRoomResponse::default());
         }
 
         let extend = upload.extend;
-        let quotas = changes.quotas(&caller);
-        let room = name.clone();
         let change = async move {
             // Uploaded data counts toward the limit until it is stored.
             let _memory = memory;
-            quotas.check(&room).await?;
             let published = if extend {
                 store.extend_room(uploaded.contents(), others).await
             } else {
@@ -181,10 +187,10 @@ impl Handlers {
     /// Receives the frames of an upload, up to its end message.
     async fn receive_frames(
         &self,
-        received: &mut Received,
+        mut received: Received,
         snapshot: &Arc<Snapshot>,
         messages: &mut Streaming<pb::CreateRoomRequest>,
-    ) -> Result<pb::UploadEnd, Error> {
+    ) -> Result<(Received, pb::UploadEnd), Error> {
         use pb::create_room_request::Message as Wire;
 
         let changes = self.changes()?;
@@ -195,7 +201,8 @@ impl Handlers {
                     let kept =
                         changes.upload_memory(&received.caller, received.kept_bytes(&batch))?;
                     received.memory.push(kept);
-                    self.take_batch(received, snapshot, batch)
+                    received = self
+                        .take_batch(received, snapshot, batch)
                         .await
                         .map_err(|error| error.within("frames"))?;
                     drop(arrived);
@@ -212,7 +219,7 @@ impl Handlers {
                     received.digest.update(&part);
                     keypoints.take(&part);
                 }
-                Some(Wire::End(end)) => return Ok(end),
+                Some(Wire::End(end)) => return Ok((received, end)),
                 Some(Wire::Room(_)) => {
                     return Err(Error::invalid("room", "may only be sent once"));
                 }
@@ -228,67 +235,21 @@ impl Handlers {
     /// Adds a batch of frames.
     async fn take_batch(
         &self,
-        received: &mut Received,
+        received: Received,
         snapshot: &Arc<Snapshot>,
         batch: pb::FrameBatch,
-    ) -> Result<(), Error> {
-        // Destructured with no `..`, so that a new field breaks the build here.
-        let pb::FrameBatch {
-            poses,
-            features,
-            images,
-            timestamps_ns,
-            frame_names,
-            sequences,
-        } = batch;
+    ) -> Result<Received, Error> {
+        // Hashing and decoding would hold up the requests of others.
+        let taken = on_blocking_thread(async move { received.take(batch) });
+        let (mut received, images) = taken.await??;
 
-        let n = poses.len() / POSE_BYTES;
-        if poses.is_empty() || poses.len() % POSE_BYTES != 0 {
-            let problem = format!(
-                "has {} bytes; n frames have n times {POSE_BYTES}, as 4 by 4 numbers of 64 bits",
-                poses.len()
-            );
-            return Err(Error::invalid("poses", problem));
+        if let Some(adapter) = received.encode_for.clone() {
+            let rows = self
+                .encoded(&received.caller, snapshot, adapter, images)
+                .await?;
+            received.rows[0].extend(rows);
         }
-
-        received.digest.update(&poses);
-        features
-            .iter()
-            .for_each(|rows| received.digest.update(rows));
-        images
-            .iter()
-            .for_each(|image| received.digest.update(image));
-
-        let before = received.frames.poses.len();
-        for (position, matrix) in poses.chunks_exact(POSE_BYTES).enumerate() {
-            let numbers = matrix.as_chunks::<8>().0.iter();
-            let matrix =
-                Matrix4::from_row_iterator(numbers.map(|bytes| f64::from_le_bytes(*bytes)));
-            let (pose, deviation) = geometry::pose_from_matrix(&matrix).map_err(|problem| {
-                let frame = before + position;
-                Error::invalid("poses", format!("the pose of frame {frame}: {problem}"))
-            })?;
-            received.worst_rotation_deviation = received.worst_rotation_deviation.max(deviation);
-            received.frames.poses.push(pose);
-        }
-
-        received.take_features(&features, n)?;
-        match &received.encode_for {
-            Some(adapter) => {
-                check_count("images", images.len(), n)?;
-                let rows = self
-                    .encoded(&received.caller, snapshot, adapter.clone(), images)
-                    .await?;
-                received.rows[0].extend(rows);
-            }
-            None if images.is_empty() => {}
-            None => {
-                let problem = "must be empty: the upload has no encode_for";
-                return Err(Error::invalid("images", problem));
-            }
-        }
-
-        received.take_columns(before, n, timestamps_ns, frame_names, sequences)
+        Ok(received)
     }
 
     /// Computes the features of images, one after another, as long work.
@@ -438,6 +399,58 @@ impl Received {
             None => 0,
         };
         batch.encoded_len().saturating_sub(images) + encoded
+    }
+
+    /// Adds a batch of frames. Returns the images, which are still to be encoded.
+    fn take(mut self, batch: pb::FrameBatch) -> Result<(Self, Vec<Vec<u8>>), Error> {
+        // Destructured with no `..`, so that a new field breaks the build here.
+        let pb::FrameBatch {
+            poses,
+            features,
+            images,
+            timestamps_ns,
+            frame_names,
+            sequences,
+        } = batch;
+
+        let n = poses.len() / POSE_BYTES;
+        if poses.is_empty() || poses.len() % POSE_BYTES != 0 {
+            let problem = format!(
+                "has {} bytes; n frames have n times {POSE_BYTES}, as 4 by 4 numbers of 64 bits",
+                poses.len()
+            );
+            return Err(Error::invalid("poses", problem));
+        }
+
+        self.digest.update(&poses);
+        features.iter().for_each(|rows| self.digest.update(rows));
+        images.iter().for_each(|image| self.digest.update(image));
+
+        let before = self.frames.poses.len();
+        for (position, matrix) in poses.chunks_exact(POSE_BYTES).enumerate() {
+            let numbers = matrix.as_chunks::<8>().0.iter();
+            let matrix =
+                Matrix4::from_row_iterator(numbers.map(|bytes| f64::from_le_bytes(*bytes)));
+            let (pose, deviation) = geometry::pose_from_matrix(&matrix).map_err(|problem| {
+                let frame = before + position;
+                Error::invalid("poses", format!("the pose of frame {frame}: {problem}"))
+            })?;
+            self.worst_rotation_deviation = self.worst_rotation_deviation.max(deviation);
+            self.frames.poses.push(pose);
+        }
+
+        self.take_features(&features, n)?;
+        match &self.encode_for {
+            Some(_) => check_count("images", images.len(), n)?,
+            None if images.is_empty() => {}
+            None => {
+                let problem = "must be empty: the upload has no encode_for";
+                return Err(Error::invalid("images", problem));
+            }
+        }
+
+        self.take_columns(before, n, timestamps_ns, frame_names, sequences)?;
+        Ok((self, images))
     }
 
     /// Adds the features of `n` frames.

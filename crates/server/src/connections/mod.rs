@@ -2,14 +2,16 @@
 //!
 //! | file | what |
 //! | --- | --- |
-//! | `unauthenticated` | connections that are closed for others at the limit |
+//! | `owners` | divides the connections among callers |
 //!
 //! tonic accepts any number of connections and keeps those that never send a byte. Here each
 //! accepted connection takes a permit. Within a time limit it must finish the TLS handshake and
 //! send as many bytes as the HTTP/2 preface has. Only then is it passed to tonic, which checks the
 //! bytes.
 
-mod unauthenticated;
+mod owners;
+
+pub use owners::Owner;
 
 use std::future::Future;
 use std::io;
@@ -17,14 +19,14 @@ use std::net::SocketAddr;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::task::{Context, Poll};
+use std::task::{Context, Poll, Waker};
 use std::time::Duration;
 
 use sha2::{Digest, Sha256};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::futures::OwnedNotified;
-use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::sync::{AcquireError, Notify, OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinSet;
 use tokio_rustls::server::TlsStream;
 use tokio_stream::Stream;
@@ -34,7 +36,7 @@ use tonic::transport::server::Connected;
 use super::metrics::Metrics;
 use super::status::Full;
 use super::tls::Tls;
-use unauthenticated::{Entry, Unauthenticated};
+use owners::{Entry, Owners};
 
 /// Length of the HTTP/2 connection preface (RFC 9113, section 3.4), bytes.
 const PREFACE: usize = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".len();
@@ -57,8 +59,8 @@ pub struct Peer {
     /// Places of the connection's health calls.
     health: Arc<Semaphore>,
     closing: Arc<Closing>,
-    /// Its place among the connections that may be closed for others.
-    entry: Arc<Entry>,
+    /// Its entry among the connections; `None` on a server without credentials.
+    entry: Option<Arc<Entry>>,
 }
 
 /// The close signal of a connection.
@@ -80,9 +82,11 @@ impl Peer {
         self.closing.close()
     }
 
-    /// Notes that a call of this connection was authenticated.
-    pub fn authenticated(&self) {
-        self.entry.remove();
+    /// Makes the caller of an admitted call the owner of the connection, see [`owners`]. Returns
+    /// false if the caller may own no further connection.
+    pub fn assign(&self, owner: Arc<dyn Owner>) -> bool {
+        let entry = self.entry.as_ref();
+        entry.is_none_or(|entry| entry.assign(owner))
     }
 }
 
@@ -120,19 +124,25 @@ enum Transport {
 struct Opener {
     places: Arc<Semaphore>,
     last_id: Arc<AtomicU64>,
-    /// Connections that may be closed for others; none on a server without credentials.
-    unauthenticated: Arc<Unauthenticated>,
-    has_credentials: bool,
+    /// Ownership of the connections; `None` on a server without credentials.
+    owners: Option<Arc<Owners>>,
     tls: Option<Arc<Tls>>,
     metrics: Metrics,
+}
+
+/// The place of a new connection.
+enum Place<W> {
+    Free(Result<OwnedSemaphorePermit, AcquireError>),
+    /// That of a connection that is being closed.
+    Awaited(W),
 }
 
 /// How connections are accepted.
 pub struct Acceptance {
     /// Maximum number of connections.
     pub most: usize,
-    /// Whether calls are authenticated. Then the oldest connection without an authenticated call is
-    /// closed for a new one at the limit; otherwise the new one is closed at once.
+    /// Whether calls are authenticated. Then connections are divided among callers, see [`owners`];
+    /// otherwise new ones are closed at the limit.
     pub has_credentials: bool,
     /// The certificate; `None` for plain text.
     pub tls: Option<Arc<Tls>>,
@@ -155,8 +165,7 @@ pub fn incoming(
     let opener = Opener {
         places: Arc::new(Semaphore::new(most)),
         last_id: Arc::default(),
-        unauthenticated: Arc::default(),
-        has_credentials,
+        owners: has_credentials.then(|| Owners::new(most)),
         tls,
         metrics,
     };
@@ -197,21 +206,29 @@ async fn accept_all(
         };
         is_refused = false;
 
-        let place = opener.places.clone().try_acquire_owned().ok();
-        if place.is_none() {
+        // The place is waited for before a connection is closed, so that no later one gets it.
+        let mut place = Box::pin(opener.places.clone().acquire_owned());
+        let mut context = Context::from_waker(Waker::noop());
+        let place = match place.as_mut().poll(&mut context) {
+            Poll::Ready(free) => Place::Free(free),
+            Poll::Pending => Place::Awaited(place),
+        };
+        let is_awaited = matches!(place, Place::Awaited(_));
+        if is_awaited {
             opener.metrics.shed(Full::Connections);
             if !is_full {
                 tracing::warn!(
-                    "connection limit reached; for each further connection, the oldest without credentials is \
-                     closed, or the new one"
+                    "connection limit reached: closing the oldest unowned connection for each new one, or the \
+                     new one if none is unowned"
                 );
             }
-            if !opener.unauthenticated.close_oldest() {
+            let owners = opener.owners.as_ref();
+            if !owners.is_some_and(|owners| owners.close_oldest()) {
                 is_full = true;
                 continue;
             }
         }
-        is_full = place.is_none();
+        is_full = is_awaited;
 
         let peer = opener.peer(address);
         let opener = opener.clone();
@@ -220,9 +237,10 @@ async fn accept_all(
             let closing = peer.closing.clone();
             let connection = async {
                 let place = match place {
-                    Some(place) => place,
-                    None => opener.freed_place().await?,
+                    Place::Free(place) => place,
+                    Place::Awaited(place) => place.await,
                 };
+                let place = place.map_err(io::Error::other)?;
                 opener.open(tcp, peer, place).await
             };
             let connection = tokio::select! {
@@ -244,10 +262,8 @@ impl Opener {
     fn peer(&self, address: SocketAddr) -> Peer {
         let id = self.last_id.fetch_add(1, Ordering::Relaxed);
         let closing = Arc::<Closing>::default();
-        let entry = self.unauthenticated.add(id, closing.clone());
-        if !self.has_credentials {
-            entry.remove();
-        }
+        let owners = self.owners.as_ref();
+        let entry = owners.map(|owners| Arc::new(owners.add(id, closing.clone())));
 
         Peer {
             id,
@@ -255,14 +271,8 @@ impl Opener {
             certificate: None,
             health: Arc::new(Semaphore::new(MOST_HEALTH_CALLS)),
             closing,
-            entry: Arc::new(entry),
+            entry,
         }
-    }
-
-    /// The place of a connection that is being closed.
-    async fn freed_place(&self) -> io::Result<OwnedSemaphorePermit> {
-        let place = self.places.clone().acquire_owned().await;
-        place.map_err(io::Error::other)
     }
 
     /// Performs the TLS handshake, if any, and reads the preface.
@@ -282,9 +292,6 @@ impl Opener {
                 peer.certificate = chain
                     .and_then(|chain| chain.first())
                     .map(|first| Sha256::digest(first).into());
-                if peer.certificate.is_some() {
-                    peer.authenticated();
-                }
                 Transport::Tls(Box::new(stream))
             }
         };

@@ -111,6 +111,29 @@ async fn hidden_adapters_are_answered_like_missing_ones() {
     }
 }
 
+/// Oracle: the contract: a caller deletes the adapters fitted to its rooms, and no others.
+#[tokio::test]
+async fn a_caller_deletes_its_own_adapters() {
+    let server = server(Config::default(), "").await;
+    let operator = client_with(&server, Some("operator")).await;
+    let lab = client_with(&server, Some("lab")).await;
+    operator.refit_room(refit("kitchen"), |_| ()).await.unwrap();
+    lab.refit_room(refit("lab"), |_| ()).await.unwrap();
+
+    let delete = async |adapter: &str| {
+        let request = pb::DeleteAdapterRequest {
+            name: format!("adapters/{adapter}"),
+            ..pb::DeleteAdapterRequest::default()
+        };
+        lab.delete_adapter(request).await
+    };
+    for adapter in ["kitchen.made-up.fitted", "base", "lab.missing"] {
+        let error = delete(adapter).await.unwrap_err();
+        assert_eq!(error.code(), Some(Code::PermissionDenied), "{adapter}");
+    }
+    assert_eq!(delete("lab.made-up.fitted").await.unwrap(), [1]);
+}
+
 /// Oracle: the contract: one fit of a caller at a time, and none once its caller has left.
 #[tokio::test]
 async fn a_fit_ends_with_its_caller() {

@@ -496,6 +496,75 @@ async fn connections_without_credentials_make_room() {
     assert!(still_open.await.is_err(), "the stream goes on");
 }
 
+/// Oracle: the contract: after a burst of connections at the limit, a newcomer takes the place of
+/// one of them at once, and not when its time limit of 10 s ends.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_burst_of_connections_keeps_nobody_out() {
+    let config = Config {
+        connections: 64,
+        ..Config::default()
+    };
+    let robot = principal("robot", "\"catalog\"", "\"*\"");
+    let server = isolation::server(config, &robot).await;
+    for _ in 0..20 {
+        let mut burst = tokio::task::JoinSet::new();
+        for _ in 0..104 {
+            let address = server.address.clone();
+            burst.spawn(async move { TcpStream::connect(address).await.unwrap() });
+        }
+        let _held = burst.join_all().await;
+
+        let newcomer = client_with(&server, Some("robot"));
+        let newcomer = tokio::time::timeout(Duration::from_secs(3), newcomer).await;
+        let answer = newcomer.expect("it is admitted").rooms().await;
+        assert!(answer.is_ok(), "{answer:?}");
+    }
+}
+
+/// Oracle: the contract: a caller that holds all connections yields to another, and a
+/// refused call holds none.
+#[tokio::test]
+async fn callers_divide_the_connections() {
+    let config = Config {
+        connections: 8,
+        ..Config::default()
+    };
+    let callers = ["greedy", "robot"].map(|name| principal(name, "\"catalog\"", "\"*\""));
+    let guest = principal("guest", "\"track\"", "\"*\"");
+    let server = isolation::server(config, &(callers.concat() + &guest)).await;
+    let call = async |client: &Client| {
+        let answer = client.rooms().await;
+        answer
+            .map(drop)
+            .map_err(|error| error.code().unwrap_or(Code::Unknown))
+    };
+
+    // Connections beyond the limit close the oldest.
+    let mut guests = Vec::new();
+    for _ in 0..16 {
+        let guest = client_with(&server, Some("guest")).await;
+        assert_eq!(call(&guest).await, Err(Code::PermissionDenied));
+        guests.push(guest);
+    }
+
+    let mut greedy = Vec::new();
+    for _ in 0..7 {
+        let client = client_with(&server, Some("greedy")).await;
+        assert_eq!(call(&client).await, Ok(()));
+        greedy.push(client);
+    }
+    let one_more = client_with(&server, Some("greedy")).await;
+    assert_eq!(call(&one_more).await, Err(Code::ResourceExhausted));
+
+    let robot = client_with(&server, Some("robot")).await;
+    assert_eq!(call(&robot).await, Ok(()));
+    assert_eq!(
+        call(&greedy[0]).await,
+        Ok(()),
+        "established connections stay"
+    );
+}
+
 /// Oracle: the bounds themselves: connections beyond the limit are closed at once, and those that
 /// say nothing do not hold up the end of the server.
 #[tokio::test]

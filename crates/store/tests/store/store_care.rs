@@ -6,12 +6,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use object_store::local::LocalFileSystem;
-use seese3_core::features::Features;
-use seese3_core::room::{FrameId, Room};
+use seese3_core::features::{FeatureSource, Features};
+use seese3_core::room::{FrameId, Room, RoomId};
 use seese3_core::training::RoomData;
 use seese3_robot::fitting::{FitRun, fit};
+use seese3_store::fit_stored_room::{Error as FitError, Refit, Request};
 use seese3_store::{
-    Choice, Defaults, Error, GarbagePolicy, Publishers, ResourceName, RoomFit, Store,
+    Choice, Defaults, Error, GarbagePolicy, Publishers, Quota, Quotas, ResourceName, RoomFit,
+    Scope, Store,
 };
 
 use crate::dying::Dying;
@@ -494,6 +496,189 @@ async fn publish_fitted(
         .publish_fitted("fitted", fitted, room_fit, features.rows())
         .await
         .unwrap();
+}
+
+/// Room `hall` as `name`, with its features as `features`.
+fn hall_as(name: &str, features: &str) -> (Room, Features) {
+    let (hall, rows) = world::served("hall");
+    let room = Room::new(
+        RoomId::new(name).unwrap(),
+        hall.frames().clone(),
+        hall.provenance().clone(),
+    );
+    let source = FeatureSource {
+        name: features.to_owned(),
+        ..rows.source().clone()
+    };
+    (
+        room.unwrap(),
+        Features::new(source, rows.rows().to_owned()).unwrap(),
+    )
+}
+
+fn fit_of(room: &str, name: Option<&str>) -> Request {
+    Request {
+        room: room.to_owned(),
+        base: None,
+        features: None,
+        name: name.map(str::to_owned),
+        own_names_only: true,
+        seed: 0,
+    }
+}
+
+/// Oracle: the contract: room `lab` with features `b.f` and room `lab.b` with features `f` have the
+/// same default name, `lab.b.f.fitted`; the second gets `lab.b.f-fitted`, and keeps it. The quota
+/// of a room counts its own adapter alone, and a deleted adapter until it is collected.
+#[tokio::test]
+async fn a_room_takes_no_name_and_no_quota_of_another() {
+    let (_folder, store) = stored().await;
+    for (name, features) in [("lab", "b.f"), ("lab.b", "f")] {
+        let (room, features) = hall_as(name, features);
+        store.publish_room(&room, &[features]).await.unwrap();
+    }
+    let fitted = async |room: &str| {
+        let mut refit = Refit::prepare(&store, fit_of(room, None)).await.unwrap();
+        let fitted = refit.fit(FitRun::UNWATCHED).unwrap();
+        refit.publish(&store, &fitted).await.unwrap();
+        refit.name().to_owned()
+    };
+    assert_eq!(fitted("lab").await, "lab.b.f.fitted");
+    assert_eq!(fitted("lab.b").await, "lab.b.f-fitted");
+    assert_eq!(fitted("lab.b").await, "lab.b.f-fitted");
+
+    for (name, is_free) in [
+        ("lab.mine", true),
+        ("lab.b.f.fitted", true),
+        ("lab.b", true),
+        ("lab.", false),
+        ("lab.b.mine", false),
+        ("lab.b.f-fitted", false),
+        ("labmine", false),
+        ("mine", false),
+    ] {
+        let answer = Refit::prepare(&store, fit_of("lab", Some(name))).await;
+        match answer {
+            Ok(_) => assert!(is_free, "{name}"),
+            Err(FitError::OtherRooms { .. }) => assert!(!is_free, "{name}"),
+            Err(error) => panic!("{name}: {error}"),
+        }
+    }
+
+    let reached = async |room: &str, caller: u64, scope: Option<Scope>| {
+        let quotas = Quotas {
+            room: of_revisions(2),
+            caller: of_revisions(caller),
+            scope,
+        };
+        match store.with_quotas(quotas).check_quotas(Some(room)).await {
+            Ok(()) => String::new(),
+            Err(error) => error.to_string(),
+        }
+    };
+    // Fitting twice with one seed gives one revision.
+    for room in ["lab", "lab.b"] {
+        let expected = format!("rooms/{room} with its fitted adapters has 2 of 2 revisions");
+        assert!(reached(room, 100, None).await.starts_with(&expected));
+    }
+    let lab: Scope = Arc::new(|room: &str| room == "lab");
+    assert!(
+        reached("other", 2, Some(lab.clone()))
+            .await
+            .starts_with("the caller has 2 of 2")
+    );
+    assert_eq!(reached("other", 3, Some(lab)).await, "");
+    assert!(
+        reached("other", 4, None)
+            .await
+            .starts_with("the caller has 4 of 4")
+    );
+
+    store
+        .remove(&named("adapters/lab.b.f.fitted"))
+        .await
+        .unwrap();
+    assert_eq!(fitted("lab.b").await, "lab.b.f-fitted", "it has that one");
+    let of_room = store.usage(&named("rooms/lab")).await.unwrap();
+    let charged = async |room: &str, bytes: u64| {
+        let limited = store.with_quotas(Quotas {
+            room: Quota {
+                revisions: None,
+                bytes: Some(bytes),
+            },
+            ..Quotas::default()
+        });
+        limited.check_quotas(Some(room)).await.is_err()
+    };
+    assert!(charged("lab", of_room.bytes + 1).await);
+
+    // The garbage of another room is not charged.
+    let of_lab = store
+        .usage(&named("adapters/lab.b.f.fitted"))
+        .await
+        .unwrap();
+    let of_lab = of_lab.bytes + of_room.bytes;
+    assert!(!charged("lab", of_lab + 1).await);
+    store
+        .remove(&named("adapters/lab.b.f-fitted"))
+        .await
+        .unwrap();
+    assert!(charged("lab", of_lab).await);
+    assert!(!charged("lab", of_lab + 1).await);
+}
+
+fn of_revisions(most: u64) -> Quota {
+    Quota {
+        revisions: Some(most),
+        bytes: None,
+    }
+}
+
+/// Oracle: the contract: at the limit new content is refused before anything is written, and a
+/// repeat of what is stored succeeds.
+#[tokio::test]
+async fn at_a_quota_nothing_is_written_and_a_repeat_succeeds() {
+    let (folder, store) = stored().await;
+    let first = [set("f", 1.0)];
+    store.publish_room(&room("a"), &first).await.unwrap();
+    let inputs = set("f", 1.0);
+    let (shallow, record) = adapter(&room("a"), &inputs);
+    store
+        .publish_adapter("any", &shallow, &record, inputs.rows())
+        .await
+        .unwrap();
+    let before = files(folder.path(), "");
+
+    let limited = store.with_quotas(Quotas {
+        caller: of_revisions(2),
+        ..Quotas::default()
+    });
+    let repeated = limited.publish_room(&room("a"), &first).await.unwrap();
+    assert_eq!((repeated.revision, repeated.is_new), (1, false));
+    let again = limited.publish_adapter("any", &shallow, &record, inputs.rows());
+    assert!(!again.await.unwrap().is_new);
+
+    let other = [set("f", 2.0)];
+    for answer in [
+        limited.publish_room(&room("a"), &other).await,
+        limited.publish_room(&room("b"), &other).await,
+        limited
+            .publish_adapter("other", &shallow, &record, inputs.rows())
+            .await,
+    ] {
+        assert!(matches!(answer, Err(Error::Quota { .. })), "{answer:?}");
+    }
+    assert_eq!(files(folder.path(), ""), before);
+    assert!(store.publish_room(&room("b"), &other).await.unwrap().is_new);
+
+    // A repeat that would have to write a missing object does not claim success.
+    for object in files(folder.path(), "rooms/a/objects/features-f") {
+        std::fs::remove_file(object).unwrap();
+    }
+    let repeated = limited.publish_room(&room("a"), &first).await;
+    assert!(matches!(repeated, Err(Error::Quota { .. })), "{repeated:?}");
+    store.publish_room(&room("a"), &first).await.unwrap();
+    store.load_room("a", None).await.unwrap();
 }
 
 /// Oracle: the promise: a revision that was published has its objects, whoever collects garbage
