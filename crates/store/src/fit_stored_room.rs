@@ -72,7 +72,8 @@ impl Refit {
     /// # Errors
     /// [`Error::Base`] if the base was trained on the room, since its errors there would be
     /// underestimated, or was fitted to any room; [`Error::Name`], [`Error::Taken`] or
-    /// [`Error::OtherRooms`] if the name cannot be published; [`Error::Store`] if the room, its features or the base cannot be read.
+    /// [`Error::OtherRooms`] if the name cannot be published; [`Error::Store`] if the room, its
+    /// features or the base cannot be read.
     pub async fn prepare(store: &Store, request: Request) -> Result<Self, Error> {
         let base = match &request.base {
             Some(name) => Some(store.load_adapter(name, None).await?),
