@@ -41,7 +41,10 @@ use seese3_lab::report::{
     AdapterJson, EvaluationContext, MotionBaselines, RoomJson, baselines_text, curve_thresholds,
     evaluation_csv, evaluation_json, evaluation_latex, evaluation_table, hit_curves, report_at,
 };
-use seese3_store::{ResourceName, Store, StoredAdapter, StoredRoom};
+use seese3_store::adapter_choice::{
+    EvaluatedRoom, EvaluationCandidate, NoDefault, for_evaluation, serving_room,
+};
+use seese3_store::{Store, StoredAdapter, StoredRoom};
 
 #[derive(Debug, Args)]
 #[command(args_conflicts_with_subcommands = true)]
@@ -111,8 +114,8 @@ struct Navigation {
     /// Name of its feature set; by default the one that the adapter was trained on
     #[arg(long)]
     features: Option<String>,
-    /// Name of the adapter; by default the newest that was trained on the room (with --split, if
-    /// given)
+    /// Name of the adapter; by default the room's default or the newest that was trained in the room,
+    /// if the test pairs are held out from it. An adapter from `fit` must be named
     #[arg(long)]
     adapter: Option<String>,
     /// Frames from the source to the target of a pair; by default as the adapter was trained
@@ -183,7 +186,7 @@ impl Navigation {
         }
 
         let store = Store::open(&self.store)?;
-        let chosen = choose(&store, &self, self.split).await?;
+        let chosen = choose(&store, &self).await?;
 
         // By default, the features are those that the adapter was trained on.
         let features_name = self
@@ -408,79 +411,73 @@ pub fn navigators_named(names: &[String]) -> anyhow::Result<Vec<NavigatorKind>> 
     names.iter().map(named).collect()
 }
 
-/// The named adapter, else the newest that was trained on the room, with these features and this
-/// split if given. An adapter with the requested stride is preferred.
-async fn choose(
-    store: &Store,
-    wanted: &Navigation,
-    split: Option<Split>,
-) -> anyhow::Result<StoredAdapter> {
+/// The named adapter, else the default adapter of an evaluation of this room: the one that a server
+/// takes.
+async fn choose(store: &Store, wanted: &Navigation) -> anyhow::Result<StoredAdapter> {
     if let Some(name) = &wanted.adapter {
         return Ok(store.load_adapter(name, None).await?);
     }
 
     // A room that is not there is reported before advice to train on it.
-    store.contents_of(&ResourceName::room(&wanted.room)).await?;
-    let names = store.adapter_names().await?;
-    let mut fitting = Vec::new();
-    for name in &names {
-        let stored = match store.load_adapter(name, None).await {
-            Ok(stored) => stored,
+    let summary = store.room_summary(&wanted.room, None).await?;
+    let mut sources = summary.features;
+    if let Some(name) = &wanted.features {
+        sources.retain(|source| source.name == *name);
+    }
+    if sources.is_empty() {
+        bail!(
+            "room '{}' has no features{}; encode its images first: `seese3 encode --store {} --room {} --model MODEL`",
+            wanted.room,
+            wanted
+                .features
+                .as_ref()
+                .map_or_else(String::new, |name| format!(" '{name}'")),
+            wanted.store,
+            wanted.room,
+        );
+    }
+
+    let defaults = store.defaults().await?;
+    let mut adapters = Vec::new();
+    for (name, revision) in store.current_adapters(&defaults).await? {
+        match store.load_adapter(&name, Some(revision)).await {
+            Ok(stored) => adapters.push(Arc::new(stored)),
             // An unreadable adapter must not hide the others.
-            Err(error) => {
-                say(format_args!("skipped adapter '{name}': {error}"));
-                continue;
-            }
-        };
-
-        // Rooms are compared by name: the adapter may have been trained on another revision.
-        let fits = wanted
-            .features
-            .as_ref()
-            .is_none_or(|name| *name == stored.adapter.source().name)
-            && stored
-                .record
-                .rooms
-                .iter()
-                .any(|(room, _)| room.as_str() == wanted.room)
-            && split.is_none_or(|split| split == stored.record.split)
-            // A fitted adapter was trained on every frame, so its scores here would be in-sample.
-            && stored.room_fit.is_none();
-
-        if fits {
-            fitting.push(stored);
+            Err(error) => say(format_args!("skipped adapter '{name}': {error}")),
         }
     }
 
-    let same_stride = |stored: &StoredAdapter| {
-        wanted
-            .stride
-            .is_none_or(|stride| stride == stored.record.stride)
-    };
+    let room = RoomId::new(&wanted.room)?;
+    let mut candidates = Vec::new();
+    for adapter in serving_room(&adapters, &room, &sources) {
+        let record = &adapter.record;
+        candidates.push(EvaluationCandidate {
+            trained_on: store.trained_on(record, &room, summary.revision).await?,
+            adapter,
+        });
+    }
 
-    // Order of preference: not from an experiment, the right stride, the newest, the name.
-    let best = |a: &StoredAdapter| {
-        (
-            !a.is_experiment,
-            same_stride(a),
-            a.created.clone(),
-            a.name.clone(),
-        )
+    let room = EvaluatedRoom {
+        room: &wanted.room,
+        chosen: defaults.adapter(&wanted.room),
+        split: wanted.split,
+        stride: wanted.stride,
     };
-
-    match fitting.into_iter().max_by(|a, b| best(a).cmp(&best(b))) {
-        Some(stored) => Ok(stored),
-        None => bail!(
-            "no adapter was trained on room '{}' with these features and this split; the store has {}; \
-             train one with `seese3 train --store {} --room {}`, or name one with --adapter",
+    match for_evaluation(&candidates, room) {
+        Ok(adapter) => Ok(Arc::unwrap_or_clone(adapter)),
+        Err(NoDefault::NoneServes { .. }) => bail!(
+            "no adapter serves room '{}'; the store has {}; train one with `seese3 train --store {} --room {}`",
             wanted.room,
-            if names.is_empty() {
-                "none".to_owned()
-            } else {
-                names.join(", ")
+            match adapters.as_slice() {
+                [] => "none".to_owned(),
+                known => {
+                    let names: Vec<&str> = known.iter().map(|known| known.name.as_str()).collect();
+                    names.join(", ")
+                }
             },
             wanted.store,
             wanted.room,
         ),
+        Err(error) => Err(anyhow::Error::new(error).context("--adapter")),
     }
 }

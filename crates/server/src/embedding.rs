@@ -179,8 +179,12 @@ impl RequestAdapter {
     /// [`Error::Invalid`] on `adapter` if it is needed; otherwise as [`Snapshot::navigator`].
     pub fn of(snapshot: &Snapshot, room: &str, adapter: &str) -> Result<Self, Error> {
         if room.is_empty() {
+            let stored = match adapter {
+                "" => snapshot.default_without_room()?,
+                name => snapshot.adapter(name)?.clone(),
+            };
             return Ok(Self {
-                stored: adapter_without_room(snapshot, adapter)?.clone(),
+                stored,
                 served: None,
             });
         }
@@ -202,27 +206,6 @@ impl RequestAdapter {
                 None => StoredFrames::RoomMissing,
             },
             detector: None,
-        }
-    }
-}
-
-/// The adapter of a request without a room: the named one, or the only one.
-fn adapter_without_room<'a>(
-    snapshot: &'a Snapshot,
-    adapter: &str,
-) -> Result<&'a Arc<StoredAdapter>, Error> {
-    if !adapter.is_empty() {
-        return snapshot.adapter(adapter);
-    }
-
-    match snapshot.adapters().len() {
-        1 => snapshot.adapters().values().next().ok_or(Error::Internal),
-        count => {
-            let problem = format!(
-                "is required when no room is named: the server has {count} adapters; two images with `camera` need \
-                 none if the server has the --encoder of a room's keypoints"
-            );
-            Err(Error::invalid("adapter", problem))
         }
     }
 }

@@ -9,7 +9,7 @@ use tonic::{Request, Response, Status};
 use tracing::Instrument;
 
 use super::convert;
-use super::snapshot::ServedNavigator;
+use super::snapshot::{ServedNavigator, WantedPairs};
 use super::workers::{CallContext, Lane};
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
@@ -133,9 +133,10 @@ fn protocol(
     } = request;
 
     // The defaults are the adapter's split and stride: its test pairs were held out in training.
-    let served = snapshot.navigator(&room, &adapter)?;
+    let split = convert::split(&split)?;
+    let served = snapshot.evaluated(&room, &adapter, WantedPairs { split, stride })?;
     let record = &served.adapter.record;
-    let split = convert::split(&split)?.unwrap_or(record.split);
+    let split = split.unwrap_or(record.split);
     let stride = stride.unwrap_or(record.stride);
 
     let navigators = convert::navigators(&navigators)?;
@@ -193,6 +194,13 @@ fn report_to_wire(
     }
 }
 
+fn is_latent(prediction: &pb::Prediction) -> bool {
+    matches!(
+        prediction.prediction,
+        Some(pb::prediction::Prediction::Latent(_))
+    )
+}
+
 fn score(
     snapshot: &Snapshot,
     request: pb::ScorePredictionsRequest,
@@ -209,7 +217,18 @@ fn score(
         thresholds,
     } = request;
 
-    let served = snapshot.navigator(&room, &adapter)?;
+    let split = convert::split(&split)?;
+    let pairs = WantedPairs {
+        split,
+        stride: None,
+    };
+    let served = match snapshot.evaluated(&room, &adapter, pairs) {
+        // No latent of an adapter is compared.
+        Err(Error::Invalid { .. }) if !predictions.iter().any(is_latent) => {
+            snapshot.navigator(&room, &adapter)?
+        }
+        served => served?,
+    };
 
     if predictions.len() > most {
         let problem = format!(
@@ -220,7 +239,7 @@ fn score(
     }
 
     let scope = PredictionScope {
-        split: convert::split(&split)?,
+        split,
         exclude_source: convert::exclusion(exclude_source, exclude_radius)?,
         thresholds: convert::thresholds(thresholds)?,
     };

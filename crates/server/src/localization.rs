@@ -457,9 +457,18 @@ fn checked_count(top_k: Option<u32>, most: u32) -> Result<u32, Error> {
     }
 }
 
+/// The names of a request's rooms; if it names none and the server has one room, that room.
+pub(super) fn rooms_or_only(snapshot: &Snapshot, rooms: &[String]) -> Vec<String> {
+    let mut served = snapshot.rooms().keys();
+    match (rooms, served.next(), served.next()) {
+        ([], Some(only), None) => vec![only.clone()],
+        _ => rooms.to_vec(),
+    }
+}
+
 /// The rooms to search, all under one adapter; at least one. An empty `rooms` selects every room
-/// that the adapter fits. An empty `adapter` selects the default of a single room, or the only
-/// adapter that fits all rooms.
+/// that the adapter serves. An empty `adapter` selects the default of a single room, or that of
+/// several ([`Snapshot::default_across`]).
 ///
 /// # Errors
 /// [`Error::NotFound`] for an unknown room or adapter, [`Error::Invalid`] if a room is named twice
@@ -471,11 +480,10 @@ pub(super) fn rooms_under(
 ) -> Result<Vec<Arc<ServedNavigator>>, Error> {
     asked_rooms(snapshot, rooms)?;
 
-    // If no adapter is named, use the default of a single named room, or the only adapter that fits
-    // all rooms.
+    let rooms = &rooms_or_only(snapshot, rooms)[..];
     let adapter = match (adapter, rooms) {
         ("", [room]) => snapshot.navigator(room, "")?.adapter.name.clone(),
-        ("", _) => only_adapter_of(snapshot, rooms)?,
+        ("", _) => snapshot.default_across(rooms, |_| true)?.name.clone(),
         (name, _) => snapshot.adapter(name)?.name.clone(),
     };
 
@@ -504,42 +512,4 @@ pub(super) fn rooms_under(
         )));
     }
     Ok(served)
-}
-
-/// The only adapter that fits all the rooms; distances under different adapters are not comparable.
-/// It is an error if none or several fit.
-fn only_adapter_of(snapshot: &Snapshot, rooms: &[String]) -> Result<String, Error> {
-    // In a search of all rooms, skip those without a fitting adapter: one of them would rule out
-    // every adapter.
-    let answered = snapshot
-        .rooms()
-        .iter()
-        .filter(|(_, room)| !room.adapters().is_empty())
-        .map(|(name, _)| name);
-    let asked: Vec<&String> = if rooms.is_empty() {
-        answered.collect()
-    } else {
-        rooms.iter().collect()
-    };
-
-    // Keep the adapters that fit every room.
-    let mut fitting: Vec<&String> = snapshot.adapters().keys().collect();
-    for room in asked {
-        let served = snapshot.room(room)?;
-        fitting.retain(|name| served.is_served_by(name));
-    }
-
-    match fitting.as_slice() {
-        [only] => Ok((*only).clone()),
-        several => {
-            let names: Vec<&str> = several.iter().map(|name| name.as_str()).collect();
-            let problem = format!(
-                "is required: {} adapters fit all these rooms ({})",
-                names.len(),
-                names.join(", ")
-            );
-
-            Err(Error::invalid("adapter", problem))
-        }
-    }
 }

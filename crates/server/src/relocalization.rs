@@ -8,7 +8,7 @@ use tonic::{Request, Response, Status};
 use super::convert;
 use super::embedding::{EmbeddedView, StoredFrames, ViewEmbedder};
 use super::image_view::{ImageView, RoomMatches, Searched, ViewFields};
-use super::localization::{self, LocatedPose, asked_rooms, localizer, rooms_under};
+use super::localization::{self, LocatedPose, asked_rooms, localizer, rooms_or_only, rooms_under};
 use super::snapshot::{ServedNavigator, ServedRoom, Snapshot};
 use super::workers::{image_count, images_of};
 use super::{Error, Handlers};
@@ -297,16 +297,32 @@ fn embedded(
 
 /// The rooms to track or relocalize in, all under one adapter; at least one. If no adapter is
 /// named, only adapters that can track in these rooms are considered: the first for a single room,
-/// else the only one. A search of all rooms skips those that are too small to track in.
+/// else the default of several. A search of all rooms skips those that are too small to track in.
 ///
 /// # Errors
-/// [`Error::Invalid`] on `adapter` if several can track; else as [`rooms_under`].
+/// [`Error::Precondition`] if no adapter can track, [`Error::Invalid`] on `adapter` if several can;
+/// else as [`rooms_under`].
 pub fn rooms_to_track_in(
     snapshot: &Snapshot,
     rooms: &[String],
     adapter: &str,
 ) -> Result<Vec<Arc<ServedNavigator>>, Error> {
-    let mut served = rooms_by_adapter(snapshot, rooms, adapter)?;
+    let adapter = match adapter {
+        "" => {
+            asked_rooms(snapshot, rooms)?;
+            tracking_adapter(snapshot, rooms)?.ok_or_else(|| {
+                Error::Precondition(
+                    "no adapter tracks or relocalizes in these rooms: none is calibrated in two or \
+                     more rooms outside its training set; train one with --calibrate-on, or add \
+                     keypoints to the rooms (`seese3 encode --recipe xfeat-keypoints`) and send images"
+                        .to_owned(),
+                )
+            })?
+        }
+        name => name.to_owned(),
+    };
+
+    let mut served = rooms_under(snapshot, rooms, &adapter)?;
     if rooms.is_empty() && served.iter().any(|served| served.map.is_some()) {
         served.retain(|served| served.map.is_some());
     }
@@ -316,94 +332,29 @@ pub fn rooms_to_track_in(
 
 /// Whether some adapter can track in these rooms; in any room if none is named.
 pub fn can_track(snapshot: &Snapshot, rooms: &[String]) -> bool {
-    let fitting = match rooms {
-        [] => adapters_that_track_anywhere(snapshot),
-        rooms => adapters_that_track_in_all(snapshot, rooms),
-    };
-    !fitting.is_empty()
+    !matches!(tracking_adapter(snapshot, rooms), Ok(None))
 }
 
-fn rooms_by_adapter(
-    snapshot: &Snapshot,
-    rooms: &[String],
-    adapter: &str,
-) -> Result<Vec<Arc<ServedNavigator>>, Error> {
-    if !adapter.is_empty() {
-        return rooms_under(snapshot, rooms, adapter);
+/// The default adapter among those that can track in these rooms: the calibrated ones. `None` if
+/// there is none.
+///
+/// # Errors
+/// [`Error::Invalid`] on `adapter` if there are several.
+fn tracking_adapter(snapshot: &Snapshot, rooms: &[String]) -> Result<Option<String>, Error> {
+    let tracks = |adapter: &StoredAdapter| adapter.adapter.error_model().is_some();
+
+    let rooms = &rooms_or_only(snapshot, rooms)[..];
+    if let [room] = rooms {
+        let adapters = snapshot.adapters_of(snapshot.room(room)?);
+        let first = adapters.iter().find(|adapter| tracks(adapter));
+        return Ok(first.map(|adapter| adapter.name.clone()));
     }
 
-    let fitting = match rooms {
-        [] => adapters_that_track_anywhere(snapshot),
-        [room] => default_that_tracks(snapshot, room),
-        several => adapters_that_track_in_all(snapshot, several),
-    };
-
-    // If no adapter can track here, `rooms_under` still selects one; `maps` then reports why it
-    // cannot track.
-    match fitting.as_slice() {
-        [] => rooms_under(snapshot, rooms, ""),
-        [only] => rooms_under(snapshot, rooms, only),
-        several => {
-            let problem = format!(
-                "is required: {} adapters can track in these rooms ({})",
-                several.len(),
-                several.join(", ")
-            );
-            Err(Error::invalid("adapter", problem))
-        }
+    match snapshot.default_across(rooms, tracks) {
+        Ok(adapter) => Ok(Some(adapter.name.clone())),
+        Err(Error::Precondition(_)) => Ok(None),
+        Err(error) => Err(error),
     }
-}
-
-/// Names of the room's calibrated adapters, the default first. They can track in the room if it is
-/// large enough.
-fn adapters_that_track(snapshot: &Snapshot, room: &ServedRoom) -> Vec<String> {
-    let adapters = snapshot.adapters_of(room);
-    let tracks = |adapter: &&Arc<StoredAdapter>| adapter.adapter.error_model().is_some();
-
-    adapters
-        .iter()
-        .filter(tracks)
-        .map(|adapter| adapter.name.clone())
-        .collect()
-}
-
-/// If no room is named: the adapters that can track in at least one room, sorted by name.
-fn adapters_that_track_anywhere(snapshot: &Snapshot) -> Vec<String> {
-    let mut names: Vec<String> = snapshot
-        .rooms()
-        .values()
-        .flat_map(|room| adapters_that_track(snapshot, room))
-        .collect();
-    names.sort_unstable();
-    names.dedup();
-    names
-}
-
-/// The room's first adapter that can track, if any.
-fn default_that_tracks(snapshot: &Snapshot, room: &str) -> Vec<String> {
-    let mut names = snapshot
-        .rooms()
-        .get(room)
-        .map_or_else(Vec::new, |room| adapters_that_track(snapshot, room));
-    names.truncate(1);
-    names
-}
-
-/// The adapters that can track in all these rooms. Rooms have no common order of preference, so the
-/// names are sorted.
-fn adapters_that_track_in_all(snapshot: &Snapshot, rooms: &[String]) -> Vec<String> {
-    let mut named = rooms.iter().filter_map(|room| snapshot.rooms().get(room));
-    let mut names = named
-        .next()
-        .map_or_else(Vec::new, |room| adapters_that_track(snapshot, room));
-    for room in named {
-        let here = adapters_that_track(snapshot, room);
-        names.retain(|name| here.contains(name));
-    }
-
-    names.sort_unstable();
-    names.dedup();
-    names
 }
 
 /// The maps of these rooms, for tracking and relocalization.
@@ -419,7 +370,7 @@ pub fn maps(served: &[Arc<ServedNavigator>]) -> Result<Vec<Arc<Map>>, Error> {
         served.map.clone().ok_or_else(|| {
             Error::Precondition(match served.adapter.adapter.error_model() {
                 None => format!(
-                    "adapter '{name}' neither tracks nor relocalises: it is not calibrated in two or more rooms outside \
+                    "adapter '{name}' neither tracks nor relocalizes: it is not calibrated in two or more rooms outside \
                      its training set; train it with --calibrate-on"
                 ),
                 Some(_) => format!("room '{room}' has too few distinct frames to track in"),

@@ -58,6 +58,7 @@ mod adapter_files;
 mod extension;
 mod map_edits;
 mod adapters;
+pub mod adapter_choice;
 
 pub use adapter_files::{check_adapter_files, stated_weights_size};
 

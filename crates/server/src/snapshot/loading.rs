@@ -29,7 +29,8 @@ use seese3_core::features::FeatureSource;
 use seese3_core::keypoints::KeypointSource;
 use seese3_core::room::RoomId;
 use seese3_encoder::Encoder;
-use seese3_store::{Defaults, Kind, RoomFit, StandingDefaults, Store, StoredAdapter};
+use seese3_store::adapter_choice::serving_room;
+use seese3_store::{Defaults, Kind, StandingDefaults, Store, StoredAdapter};
 
 /// Whether previously refused revisions are retried.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -440,18 +441,18 @@ impl Loader {
             })
         })?;
 
-        let serving = known.map_or_else(Vec::new, |known| known.adapters());
+        let served = known.map_or_else(Vec::new, |known| known.adapters());
         let candidate = |adapter: Arc<StoredAdapter>| {
             let is_earlier = |served: &&Arc<StoredAdapter>| {
                 served.name == adapter.name && served.revision != adapter.revision
             };
             Candidate {
-                earlier: serving.iter().find(is_earlier).cloned(),
+                earlier: served.iter().find(is_earlier).cloned(),
                 adapter,
             }
         };
-        let fitting = fitting(adapters, &id, &summary.features);
-        let candidates = fitting.into_iter().map(candidate).collect();
+        let serving = serving_room(adapters.values(), &id, &summary.features);
+        let candidates = serving.into_iter().map(candidate).collect();
 
         let room = ServedRoom::new(id, summary, candidates, self.rooms.clone());
         if self.memory.preload || known.is_some_and(|known| known.in_memory().is_some()) {
@@ -485,12 +486,12 @@ fn is_up_to_date(
     adapters: &BTreeMap<String, Arc<StoredAdapter>>,
     refused: Refused,
 ) -> bool {
-    let fitting = fitting(adapters, &room.id, &room.summary.features);
+    let serving = serving_room(adapters.values(), &room.id, &room.summary.features);
     let tried = room.candidates.iter().map(|candidate| &candidate.adapter);
     let is_same = |(tried, now): (&Arc<StoredAdapter>, &Arc<StoredAdapter>)| {
         (&tried.name, tried.revision) == (&now.name, now.revision)
     };
-    if tried.len() != fitting.len() || !tried.zip(&fitting).all(is_same) {
+    if tried.len() != serving.len() || !tried.zip(&serving).all(is_same) {
         return false;
     }
 
@@ -547,39 +548,4 @@ fn opened_for(
         tracing::error!(adapter, %problem, "no image encoder; the adapter takes only features");
         None
     })
-}
-
-/// The adapters compatible with a room that has features of these sources, in order of preference:
-/// fitted to this room, then trained in it, then newest; adapters of experiments last. The first is
-/// the room's default unless the operator chose one.
-fn fitting(
-    adapters: &BTreeMap<String, Arc<StoredAdapter>>,
-    room: &RoomId,
-    sources: &[FeatureSource],
-) -> Vec<Arc<StoredAdapter>> {
-    // An adapter is compatible with a room that has features of its source settings. A fitted
-    // adapter serves only its own room.
-    let fits = |adapter: &&Arc<StoredAdapter>| {
-        let has_features = sources
-            .iter()
-            .any(|source| source.is_like(adapter.adapter.source()));
-        let is_of_another = |fit: &RoomFit| fit.room != *room;
-
-        has_features && !adapter.room_fit.as_ref().is_some_and(is_of_another)
-    };
-    let rank = |adapter: &StoredAdapter| {
-        let is_trained_here = adapter.record.rooms.iter().any(|(name, _)| name == room);
-        let is_fitted_here = adapter.room_fit.is_some();
-        (
-            !adapter.is_experiment,
-            is_fitted_here,
-            is_trained_here,
-            adapter.created.clone(),
-            adapter.name.clone(),
-        )
-    };
-
-    let mut ranked: Vec<Arc<StoredAdapter>> = adapters.values().filter(fits).cloned().collect();
-    ranked.sort_by_key(|adapter| std::cmp::Reverse(rank(adapter)));
-    ranked
 }

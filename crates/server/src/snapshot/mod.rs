@@ -23,7 +23,11 @@ use super::decoding::DecodingMemory;
 use super::image_encoder::ImageEncoder;
 use super::metrics::ServedCounts;
 use seese3_core::keypoints::KeypointSource;
+use seese3_core::splits::Split;
 use seese3_store::StoredAdapter;
+use seese3_store::adapter_choice::{
+    EvaluatedRoom, EvaluationCandidate, NoDefault, RoomAdapters, across_rooms, for_evaluation,
+};
 
 /// A stored revision that cannot be served.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -327,6 +331,128 @@ impl Snapshot {
             .cloned()
             .ok_or_else(|| does_not_serve(served, &wanted))
     }
+
+    /// The navigator of an evaluation in a room. If no adapter is named: the default adapter of
+    /// evaluations, for which the test pairs are held out. Loads the room if it is not in memory.
+    ///
+    /// # Errors
+    /// As [`Snapshot::navigator`]; [`Error::Invalid`] on `adapter` if the test pairs are held out
+    /// from no adapter.
+    pub fn evaluated(
+        &self,
+        room: &str,
+        adapter: &str,
+        pairs: WantedPairs,
+    ) -> Result<Arc<ServedNavigator>, Error> {
+        if !adapter.is_empty() {
+            return self.navigator(room, adapter);
+        }
+
+        let loaded = self.room(room)?.load()?;
+        let candidate = |served: &Arc<ServedNavigator>| EvaluationCandidate {
+            adapter: served.adapter.clone(),
+            trained_on: served.trained_on,
+        };
+        let candidates: Vec<_> = loaded.navigators.iter().map(candidate).collect();
+        let wanted = EvaluatedRoom {
+            room,
+            chosen: self.default_adapters.get(room).map(String::as_str),
+            split: pairs.split,
+            stride: pairs.stride,
+        };
+        let best = for_evaluation(&candidates, wanted)?;
+        loaded.under_any(&best.name).cloned().ok_or(Error::Internal)
+    }
+
+    /// The default adapter of a task in these rooms, among the adapters that `counts` accepts. With
+    /// no room: in all rooms that such an adapter serves.
+    ///
+    /// # Errors
+    /// As [`Snapshot::room`]; [`Error::Invalid`] on `adapter` if several adapters serve the rooms,
+    /// [`Error::Precondition`] if none does.
+    pub fn default_across(
+        &self,
+        rooms: &[String],
+        counts: impl Fn(&StoredAdapter) -> bool,
+    ) -> Result<Arc<StoredAdapter>, Error> {
+        let of_room = |served: &Arc<ServedRoom>| {
+            let mut adapters = served.adapters();
+            adapters.retain(|adapter| counts(adapter));
+            adapters
+        };
+        let mut served: Vec<_> = match rooms {
+            [] => self
+                .rooms
+                .values()
+                .map(|room| (room, of_room(room)))
+                .collect(),
+            named => {
+                let named = named.iter().map(|name| {
+                    let room = self.room(name)?;
+                    Ok((room, of_room(room)))
+                });
+                named.collect::<Result<_, Error>>()?
+            }
+        };
+        if rooms.is_empty() {
+            let is_for_any_room = |adapter: &Arc<StoredAdapter>| adapter.room_fit.is_none();
+            served.retain(|(_, adapters)| adapters.iter().any(is_for_any_room));
+        }
+
+        let served = served.into_iter().map(|(room, adapters)| RoomAdapters {
+            room: room.id.as_str(),
+            chosen: self
+                .default_adapters
+                .get(room.id.as_str())
+                .map(String::as_str),
+            adapters,
+        });
+        let served: Vec<RoomAdapters<'_>> = served.collect();
+        Ok(across_rooms(&served)?)
+    }
+
+    /// The default adapter of a task without a room: the only one that is not fitted to a room, else
+    /// the only one.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] on `adapter` if there are several.
+    pub fn default_without_room(&self) -> Result<Arc<StoredAdapter>, Error> {
+        let mut adapters = self.adapters.values();
+        if let (Some(only), None) = (adapters.next(), adapters.next()) {
+            return Ok(only.clone());
+        }
+
+        let anywhere = RoomAdapters {
+            room: "",
+            chosen: None,
+            adapters: self.adapters.values().cloned().collect(),
+        };
+        across_rooms(&[anywhere]).map_err(|error| match error {
+            NoDefault::NoneServes { .. } => Error::invalid(
+                "adapter",
+                "is required when no room is named: every adapter is fitted to a room",
+            ),
+            error => error.into(),
+        })
+    }
+}
+
+impl From<NoDefault> for Error {
+    fn from(error: NoDefault) -> Self {
+        match error {
+            NoDefault::NoneServes { .. } => Self::Precondition(error.to_string()),
+            NoDefault::Several { .. } | NoDefault::AllLeak { .. } => {
+                Self::invalid("adapter", error)
+            }
+        }
+    }
+}
+
+/// The test pairs of an evaluation, as far as a request states them.
+#[derive(Debug, Clone, Copy)]
+pub struct WantedPairs {
+    pub split: Option<Split>,
+    pub stride: Option<u32>,
 }
 
 /// The error for an adapter that does not serve a room.

@@ -5,15 +5,17 @@ use std::sync::Arc;
 
 use seese3_client::convert;
 use seese3_client::proto::v1 as pb;
+use seese3_core::adapter::Preset;
 use seese3_core::geometry::PoseError;
 use seese3_core::room::FrameId;
-use seese3_core::training::RoomData;
+use seese3_core::splits::Split;
+use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
 use seese3_robot::fitting::{FitRun, fit};
 use seese3_server::Config;
 use seese3_store::{BaseAdapter, RoomFit, Store};
 use tonic::Code;
 
-use crate::harness::{TestServer, feature, frame, latent, start_on};
+use crate::harness::{TestServer, feature, frame, latent, refused, start_on, until};
 use seese3_testing::world::{calibrated, served};
 
 /// The places hall and attic, an adapter of both, and one that goes on from it in the hall.
@@ -233,4 +235,103 @@ async fn a_fitted_room_is_relocalised_by_its_own_adapter() {
     let view = latent(calibrated().0.embed_one(&row).unwrap().to_vec());
     let found = server.client.relocalize(ask(view)).await.unwrap();
     assert!(found.rooms.iter().all(|room| room.fitted.is_none()));
+}
+
+/// Oracle: the rules of docs/defaults.md. The server has rooms hall and attic, an adapter of both and
+/// one that is fitted to the hall.
+#[tokio::test]
+async fn a_fitted_adapter_does_not_count_where_no_room_is_named() {
+    let server = server().await;
+    let client = &server.client;
+    let (_, features) = served("attic");
+    let view = || feature(features.rows().row(20).to_vec());
+
+    let located = pb::LocalizeRequest {
+        view: view(),
+        ..Default::default()
+    };
+    let relocalized = pb::RelocalizeRequest {
+        views: view().into_iter().collect(),
+        ..Default::default()
+    };
+    let motion = pb::EstimateMotionRequest {
+        first: view(),
+        second: view(),
+        ..Default::default()
+    };
+    let encoded = pb::EncodeRequest {
+        views: view().into_iter().collect(),
+        ..Default::default()
+    };
+    let used = [
+        client.localize(located).await.unwrap().adapter,
+        client.relocalize(relocalized).await.unwrap().adapter,
+        client.estimate_motion(motion).await.unwrap().adapter,
+        client.encode(encoded).await.unwrap().adapter,
+    ];
+    for adapter in used {
+        assert_eq!(adapter.unwrap().name, "base");
+    }
+
+    let in_the_hall = pb::LocalizeRequest {
+        rooms: vec!["hall".to_owned()],
+        view: view(),
+        ..Default::default()
+    };
+    let used = client.localize(in_the_hall).await.unwrap().adapter;
+    assert_eq!(used.unwrap().name, "hall.fitted");
+}
+
+/// Oracle: the training records. Both adapters were trained on every frame of the hall, a third one on
+/// the first four fifths.
+#[tokio::test]
+async fn an_evaluation_takes_an_adapter_that_has_not_seen_the_test_frames() {
+    let server = server().await;
+    let client = &server.client;
+    let request = || pb::EvaluateRequest {
+        room: "hall".to_owned(),
+        navigators: vec!["identity".to_owned()],
+        ..Default::default()
+    };
+    let leaking = client.evaluate(request(), |_| ()).await;
+    refused("all leak", leaking, Code::InvalidArgument, "adapter");
+
+    let store = Store::open(server.folder.path().to_str().unwrap()).unwrap();
+    let (room, features) = served("hall");
+    let data = RoomData {
+        room: &room,
+        revision: 1,
+        features: &features,
+    };
+    let mut plan = TrainingPlan::of(Preset::PaperBase, Split::Time, 10, 0);
+    plan.config.epochs = 1;
+    let (adapter, record) = train_adapter(&[data], &plan, &mut |_| ()).unwrap();
+    let published = store.publish_adapter("held-out", &adapter, &record, features.rows());
+    published.await.unwrap();
+
+    let report = until(
+        "the new adapter is served",
+        async || client.evaluate(request(), |_| ()).await,
+        Result::is_ok,
+    )
+    .await
+    .unwrap();
+    assert_eq!(report.adapter.unwrap().name, "held-out");
+    assert_eq!((report.split.as_str(), report.stride), ("time", 10));
+    assert!(!report.leaks && report.in_room);
+
+    // The same adapter has seen test frames of another split.
+    let of_another_split = pb::EvaluateRequest {
+        split: "blocks".to_owned(),
+        ..request()
+    };
+    let leaking = client.evaluate(of_another_split, |_| ()).await;
+    refused("all leak", leaking, Code::InvalidArgument, "adapter");
+
+    // A named adapter is evaluated, and the report says that it leaks.
+    let named = pb::EvaluateRequest {
+        adapter: "hall.fitted".to_owned(),
+        ..request()
+    };
+    assert!(client.evaluate(named, |_| ()).await.unwrap().leaks);
 }
