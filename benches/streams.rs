@@ -133,12 +133,12 @@ impl OdometryService for Echo {
         request: tonic::Request<tonic::Streaming<pb::TrackRequest>>,
     ) -> Result<tonic::Response<Self::TrackStream>, tonic::Status> {
         let answers = request.into_inner().map(|message| {
-            let sequence = match message?.message {
-                Some(Message::Frame(frame)) => frame.sequence,
+            let sequence_number = match message?.message {
+                Some(Message::Frame(frame)) => frame.sequence_number,
                 _ => 0,
             };
             let update = pb::TrackUpdate {
-                sequence,
+                sequence_number,
                 ..pb::TrackUpdate::default()
             };
 
@@ -226,10 +226,10 @@ async fn load(
                     });
 
                     let timestamp_ns = ((number as f64 + 1.0) / hz * 1e9) as i64;
-                    let sequence = number as u64 + 1;
+                    let sequence_number = number as u64 + 1;
                     let frame = pb::TrackFrame {
                         timestamp_ns,
-                        sequence,
+                        sequence_number,
                         view,
                         ..pb::TrackFrame::default()
                     };
@@ -250,9 +250,9 @@ async fn load(
             let mut latencies = Vec::with_capacity(count);
             while let Some(answer) = answers.message().await.unwrap() {
                 if let Some(Answer::Update(update)) = answer.answer
-                    && update.sequence > 0
+                    && update.sequence_number > 0
                 {
-                    let due = first + period * (update.sequence as u32 - 1);
+                    let due = first + period * (update.sequence_number as u32 - 1);
                     latencies.push(due.elapsed().as_secs_f64() * 1e3);
                 }
             }

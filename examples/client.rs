@@ -38,7 +38,7 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
                 )),
             }),
             steps: Some(4),
-            mode: pb::Mode::ClosedLoop.into(),
+            step_mode: pb::StepMode::ClosedLoop.into(),
             ..Default::default()
         })
         .await?;
@@ -64,7 +64,7 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
             ..Default::default()
         })
         .await?;
-    let read = convert::twist(&answer.motion.unwrap_or_default())?;
+    let read = convert::twist(&answer.motion.unwrap_or_default().twist.unwrap_or_default())?;
     println!("read: {:.3} m", read.linear.norm());
 
     if let Some(truth) = &answer.true_motion {

@@ -101,7 +101,7 @@ def main():
     config_file.write_text(json.dumps(config, indent=2))
 
     print(
-        f"seese3 encode --store store --room ROOM --model {model_file} --preprocess {config_file} "
+        f"seese3 encode --store store --room ROOM --encoder {model_file} --preprocess {config_file} "
         f"--prefix-tokens {prefix_tokens} --base 0 --norm none --layers {names[len(names) * 2 // 3]}"
     )
 

@@ -17,7 +17,7 @@ use super::progress::bar;
 use super::train::{default_name, train_with_progress};
 use seese3_client::proto::v1 as pb;
 use seese3_client::{Client, convert};
-use seese3_core::adapter::{Adapter, Preset};
+use seese3_core::adapter::{Adapter, Preset, TrainingRecord};
 use seese3_core::cancel::Cancellation;
 use seese3_core::eval::{Protocol, evaluate};
 use seese3_core::features::Features;
@@ -39,6 +39,8 @@ const STEPS: u32 = 4;
 /// Maximum number of polls, 50 ms apart, while the server loads its store: 60 s in all.
 const LOADING_POLLS: u32 = 1_200;
 const MOST_FRAMES: usize = 100_000;
+/// Enough frames to learn motions from.
+const DEFAULT_FRAMES: usize = 2_000;
 
 #[derive(Debug, Args)]
 pub struct Demo {
@@ -49,7 +51,7 @@ pub struct Demo {
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
     seed: u64,
     /// Number of images to render, at most 100000
-    #[arg(long, default_value_t = 2_000)]
+    #[arg(long, default_value_t = DEFAULT_FRAMES)]
     frames: usize,
     #[command(flatten)]
     json: JsonOutput,
@@ -113,6 +115,7 @@ impl Demo {
 
         let SeededTraining { adapter, runs } = train_with_progress(&rooms, &plan, 1)?;
         say(training_table(&runs));
+        warn_if_too_short(&runs[0].record, self.frames);
         let name = default_name(&rooms, &plan);
         let adapter_published = store
             .publish_adapter(&name, &adapter, &runs[0].record, rooms[0].1.rows())
@@ -288,6 +291,17 @@ async fn serve_and_ask(
     Ok(answer)
 }
 
+/// Says so if the adapter predicts held-out motions worse than their own mean does.
+fn warn_if_too_short(record: &TrainingRecord, frames: usize) {
+    let r2 = record.test.overall;
+    if r2 < 0.0 && frames < DEFAULT_FRAMES {
+        say(format_args!(
+            "   {frames} images are too few to learn motions from (R² {r2:.2} on held-out frames, \
+             where 0 is a constant); use --frames {DEFAULT_FRAMES} or more"
+        ));
+    }
+}
+
 /// Start frame of the example: five sixths into the held-out frames that have a successor STRIDE
 /// frames later.
 fn example_source(frame_count: usize) -> u32 {
@@ -338,7 +352,7 @@ async fn ask(
             )),
         }),
         steps: Some(STEPS),
-        mode: pb::Mode::ClosedLoop.into(),
+        step_mode: pb::StepMode::ClosedLoop.into(),
         ..pb::NavigateRequest::default()
     };
 

@@ -31,7 +31,7 @@ pub struct Encode {
     #[arg(long)]
     room: String,
     /// The encoder: an ONNX file, or `pixels` or `builtin`, which need no model file
-    #[arg(long)]
+    #[arg(long = "encoder", value_name = "MODEL")]
     model: String,
     #[command(flatten)]
     encoder: EncoderOptions,

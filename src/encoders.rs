@@ -13,7 +13,7 @@ Without a model:
   pixels    raw pixels at 320x240, averaged over 16x12 patches, 576 columns
   builtin   gradient orientations and color, weight-free stand-in, 528 columns
 
-With a model: seese3 encode --model FILE.onnx --recipe NAME. Any ONNX image model with named outputs
+With a model: seese3 encode --encoder FILE.onnx --recipe NAME. Any ONNX image model with named outputs
 works; without a recipe, give the preprocessing (--resize, --divisor, --mean, --std).
 ";
 

@@ -15,7 +15,7 @@ const EXIT_CODES: &str = "Exit codes:\n  \
 const EXAMPLES: &str = "\
 demo
   seese3 demo
-  seese3 demo --frames 500 --out small
+  seese3 demo --seed 2 --out another-room
 import
   seese3 import folder photos --room kitchen --store store
   seese3 import colmap project --store store --scale 1
@@ -41,15 +41,15 @@ export
   seese3 export numpy --store store --room kitchen --out kitchen-numpy
   seese3 export tum --store store --room kitchen --out kitchen.tum --rate 30
 encode
-  seese3 encode --store store --room kitchen --model pixels
-  seese3 encode --store store --room kitchen --model effnetlite0.onnx --recipe effnetlite0 --layers block14
-  seese3 encode --store store --room kitchen --model vit.onnx --resize 224x224 --preprocess imagenet --pool cls
+  seese3 encode --store store --room kitchen --encoder pixels
+  seese3 encode --store store --room kitchen --encoder effnetlite0.onnx --recipe effnetlite0 --layers block14
+  seese3 encode --store store --room kitchen --encoder vit.onnx --resize 224x224 --preprocess imagenet --pool cls
 encoders
   seese3 encoders
   seese3 encoders dinov2-b
 studio
-  seese3 studio --rooms 20 --frames 400 --seed 7 --out suite --keep-images
-  seese3 studio --suite returns --rooms 3 --frames 600 --out returns --encode pixels
+  seese3 studio --rooms 20 --frames 400 --seed 7 --store suite --keep-images
+  seese3 studio --suite returns --rooms 3 --frames 600 --store returns --encoder pixels
 train
   seese3 train --store store --room kitchen --features pixels --stride 20 --split blocks
   seese3 train --store suite --room 'studio7-000*' --preset steady --split whole --calibrate-on 'studio7-001*' --name robot
@@ -128,25 +128,28 @@ store gc
 store verify
   seese3 store verify --store store
 push
-  seese3 push --store store rooms/kitchen --server 127.0.0.1:50051 --refit
+  seese3 push --store store rooms/kitchen --server 127.0.0.1:50051 --fit
 config
   seese3 config check --store store --config server.toml
   seese3 config print --store store
 navigate
   seese3 navigate --room kitchen --from 100 --to 140 --steps 4 --mode closed-loop
   seese3 navigate --room kitchen --image photo.jpg --twist 0,0,0.5,0,0,0 --json -
+plan
+  seese3 plan --room kitchen --from 100 --to 140
+  seese3 plan --room kitchen --image photo.jpg --camera mapping --to-pose 1.5,0,2,0,0,0,1
 localize
   seese3 localize --room kitchen --image photo.jpg
-  seese3 localize --feature features.npy --row 7 --top-k 3 --json -
+  seese3 localize --feature-file features.npy --row 7 --top-k 3 --json -
 relocalize
   seese3 relocalize --images before.jpg,now.jpg
-  seese3 relocalize --room kitchen --features features.npy --rows 3,4,5
+  seese3 relocalize --room kitchen --feature-file features.npy --rows 3,4,5
 motion
   seese3 motion --images a.jpg,b.jpg --camera 640x480,525
   seese3 motion --room kitchen --from 100 --to 110
 track
-  seese3 track --room kitchen --images frames --hz 30 --tum path.tum --mcap run.mcap
-  seese3 track --room kitchen --feature features.npy --json - | jq .status
+  seese3 track --room kitchen --images frames --rate 30 --tum path.tum --mcap run.mcap
+  seese3 track --room kitchen --feature-file features.npy --json - | jq .status
 catalog
   seese3 catalog
   seese3 catalog --server robot:50051 --json -

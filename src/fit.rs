@@ -2,11 +2,12 @@
 
 use clap::Args;
 use indicatif::ProgressBar;
+use serde::Serialize;
 use serde_json::json;
 
 use seese3_core::cancel::Cancellation;
 use seese3_core::training::RoomData;
-use seese3_robot::fitting::{FITTING_EPOCHS, FitRun, Fitted, PartRule};
+use seese3_robot::fitting::{FITTING_EPOCHS, FitRun, Fitted};
 
 use super::output::{say, say_published};
 use super::progress::bar;
@@ -66,11 +67,12 @@ impl Fit {
             "created": published.is_new,
             "room": refit.data().room.id().as_str(),
             "train_r2": fitted.record.train.overall,
+            "expected_errors": expected_errors(&fitted),
         }))
     }
 }
 
-/// Prints a summary of the fit and the measured rules.
+/// Prints a summary of the fit and the expected errors.
 fn say_fitted(fitted: &Fitted, data: &RoomData<'_>) {
     let mapped = data.room.frame_count();
     say(format_args!(
@@ -81,25 +83,48 @@ fn say_fitted(fitted: &Fitted, data: &RoomData<'_>) {
         fitted.record.train.overall
     ));
 
-    say("rules measured on held-out frames, by distance of the view from the map:");
-    for rule in fitted.rules.rules() {
+    say(
+        "expected error of a view, by the distance of its feature from the nearest mapped feature:",
+    );
+    for expected in expected_errors(fitted) {
         say(format_args!(
-            "  up to {:.3}: translation {}, rotation {}",
-            rule.up_to,
-            part_words(rule.translation),
-            part_words(rule.rotation)
+            "  up to {:.3}: {:.3} m, {:.1}°",
+            expected.feature_distance,
+            expected.translation_m,
+            expected.rotation_rad.to_degrees()
         ));
     }
+}
+
+/// The error that cross-validation leads to expect of views up to a distance from the map.
+#[derive(Debug, Serialize)]
+struct ExpectedError {
+    /// Largest distance of the view's feature from the nearest mapped feature, in standard
+    /// deviations of a feature column.
+    feature_distance: f64,
+    /// Root mean square of the position error, meters.
+    translation_m: f64,
+    /// Root mean square of the rotation error, radians.
+    rotation_rad: f64,
+}
+
+/// Expected errors at the median disagreement of the held-out views, nearest views first.
+fn expected_errors(fitted: &Fitted) -> Vec<ExpectedError> {
+    let expected = fitted.rules.rules().iter().map(|rule| {
+        let median_disagreement = 4.0 * rule.least_disagreement;
+        let variances = rule
+            .covariance_at(rule.up_to, median_disagreement)
+            .diagonal();
+        ExpectedError {
+            feature_distance: rule.up_to,
+            translation_m: variances.fixed_rows::<3>(0).sum().sqrt(),
+            rotation_rad: variances.fixed_rows::<3>(3).sum().sqrt(),
+        }
+    });
+    expected.collect()
 }
 
 /// A progress bar over the epochs of a fit and its folds; empty without a fit.
 pub fn fitting_bar(is_fitted: bool) -> ProgressBar {
     bar(if is_fitted { FITTING_EPOCHS } else { 0 }, "fitting")
-}
-
-fn part_words(rule: PartRule) -> String {
-    if rule.gain == 0.0 {
-        return rule.reader.to_string();
-    }
-    format!("{} × {:.1}", rule.reader, rule.gain)
 }

@@ -12,7 +12,7 @@ pub struct Health {
     #[command(flatten)]
     server: Server,
     /// What to check: a gRPC service's full name, or rooms/NAME; the whole server if empty
-    #[arg(long, default_value = "")]
+    #[arg(long, default_value = "", hide_default_value = true)]
     name: String,
     #[command(flatten)]
     json: JsonOutput,

@@ -3,6 +3,7 @@
 
 mod camera;
 mod examples;
+mod help;
 mod log;
 mod named;
 mod output;
@@ -184,7 +185,9 @@ enum Command {
     Config(Box<config::Config>),
     /// Ask a server for the frames that a camera motion leads to
     Navigate(ask::Navigate),
-    /// Ask a server for the mapped frames most similar to a view
+    /// Ask a server for a route of stored frames from a view to a goal
+    Plan(ask::Plan),
+    /// Ask a server for the camera pose of a view, and the mapped frames most similar to it
     Localize(ask::Localize),
     /// Ask a server for the room and the pose of a camera, with covariance, from one or more views
     Relocalize(ask::Relocalize),
@@ -257,6 +260,7 @@ async fn dispatch(cli: Cli) -> anyhow::Result<()> {
         Command::Push(arguments) => arguments.run().await,
         Command::Config(arguments) => arguments.run(),
         Command::Navigate(arguments) => arguments.run().await,
+        Command::Plan(arguments) => arguments.run().await,
         Command::Localize(arguments) => arguments.run().await,
         Command::Relocalize(arguments) => arguments.run().await,
         Command::Motion(arguments) => arguments.run().await,

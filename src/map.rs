@@ -39,7 +39,7 @@ enum What {
 #[derive(Debug, Args)]
 struct Common {
     /// The store
-    #[arg(long, env = "SEESE3_STORE")]
+    #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
     store: String,
     /// The room
     #[arg(long)]

@@ -102,6 +102,17 @@ fn with_advice(warning: &PoseWarning, from: PosesFrom) -> String {
     }
 }
 
+/// What to do about poses that the images contradict; `None` if they do not.
+pub fn contradiction(report: &PoseReport, from: PosesFrom) -> Option<String> {
+    report.warnings.iter().find_map(|warning| match warning {
+        PoseWarning::Verdict { check, .. } if check.verdict.is_contradiction() => {
+            let advice = verdict_advice(&check.verdict, from);
+            Some(advice.unwrap_or_else(|| "correct the poses and import again".to_owned()))
+        }
+        _ => None,
+    })
+}
+
 /// The option of `import` that states the fitted camera.
 fn camera_flag(fitted: &FittedCamera) -> String {
     let (width, _) = fitted.image_size;

@@ -28,6 +28,10 @@ pub struct Push {
     /// The name on the server; the same if omitted
     #[arg(long = "as", value_name = "NAME")]
     renamed: Option<String>,
+    /// Publish a new revision of the room or adapter of this name on the server, in place of its
+    /// content. Without it, a name that the server has with other content is refused
+    #[arg(long, conflicts_with = "extend")]
+    replace: bool,
     /// Append the frames to the room of this name on the server; their poses must be in its world
     /// frame
     #[arg(long)]
@@ -36,11 +40,11 @@ pub struct Push {
     #[arg(long, requires = "extend")]
     drop_other_features: bool,
     /// For a room: afterwards let the server fit an adapter to all of its frames
-    #[arg(long, conflicts_with = "validate_only")]
-    refit: bool,
-    /// Only validate the upload on the server; publish nothing
+    #[arg(long, conflicts_with = "dry_run")]
+    fit: bool,
+    /// Let the server check the upload, and publish nothing
     #[arg(long)]
-    validate_only: bool,
+    dry_run: bool,
     #[command(flatten)]
     server: Server,
 }
@@ -49,8 +53,8 @@ impl Push {
     pub async fn run(self) -> anyhow::Result<()> {
         let store = self.common.open()?;
         let target = target(&self.name, self.renamed.as_deref())?;
-        if (self.extend || self.refit) && self.name.kind == Kind::Adapter {
-            bail!("--extend and --refit are for rooms; an adapter is published as a whole");
+        if (self.extend || self.fit) && self.name.kind == Kind::Adapter {
+            bail!("--extend and --fit are for rooms; an adapter is published as a whole");
         }
         let client = self.server.connect().await?;
 
@@ -60,15 +64,16 @@ impl Push {
                 let stored = store.load_room(&self.name.name, self.name.revision).await?;
                 has_keypoints = stored.keypoints.is_some();
                 let messages = room_messages(&stored, self.upload(&stored, &target)?)?;
-                let answer = client.create_room(tokio_stream::iter(messages)).await;
+                let answer = client.upload_room(tokio_stream::iter(messages)).await;
                 let answer = answer.map_err(unanswered)?;
                 (answer.revision, answer.created, answer.served)
             }
             Kind::Adapter => {
                 let files = store.adapter_files(&self.name.name, self.name.revision);
                 let (manifest, weights) = files.await?;
-                let messages = adapter_messages(manifest, &weights, &target, self.validate_only);
-                let answer = client.publish_adapter(tokio_stream::iter(messages)).await;
+                let upload = self.adapter_upload(manifest, &target);
+                let messages = adapter_messages(upload, &weights);
+                let answer = client.upload_adapter(tokio_stream::iter(messages)).await;
                 let answer = answer.map_err(unanswered)?;
                 (answer.revision, answer.created, answer.served)
             }
@@ -101,7 +106,7 @@ impl Push {
         }
 
         let mut fitted_adapter = None;
-        if self.refit {
+        if self.fit {
             let fitted = refitted(&client, &target).await?;
             fitted_adapter = Some(json!({ "name": fitted.name, "revision": fitted.revision }));
         }
@@ -113,6 +118,25 @@ impl Push {
             "served": served,
             "fitted_adapter": fitted_adapter,
         }))
+    }
+
+    fn mode(&self) -> pb::UploadMode {
+        match (self.replace, self.extend) {
+            (true, _) => pb::UploadMode::Replace,
+            (_, true) => pb::UploadMode::Extend,
+            (false, false) => pb::UploadMode::Create,
+        }
+    }
+
+    /// The description of an adapter's upload.
+    fn adapter_upload(&self, manifest: Vec<u8>, target: &ResourceName) -> pb::AdapterUpload {
+        pb::AdapterUpload {
+            adapter: target.name.clone(),
+            mode: self.mode().into(),
+            manifest,
+            request_id: String::new(),
+            validate_only: self.dry_run,
+        }
     }
 
     /// The description of a room's upload.
@@ -133,17 +157,17 @@ impl Push {
         };
 
         Ok(pb::RoomUpload {
-            name: target.to_string(),
+            room: target.name.clone(),
+            mode: self.mode().into(),
             features: stored
                 .features
                 .iter()
                 .map(|set| source_to_wire(set.source()))
                 .collect(),
             format: own(&provenance.format),
-            licence: own(&provenance.licence),
+            license: own(&provenance.licence),
             camera: provenance.camera.as_ref().map(camera_to_wire),
-            validate_only: self.validate_only,
-            extend: self.extend,
+            validate_only: self.dry_run,
             drop_other_features: self.drop_other_features,
             keypoints,
             ..pb::RoomUpload::default()
@@ -153,11 +177,11 @@ impl Push {
 
 /// Lets the server fit an adapter to a room.
 async fn refitted(client: &Client, room: &ResourceName) -> anyhow::Result<pb::Revision> {
-    let request = pb::RefitRoomRequest {
-        name: room.to_string(),
-        ..pb::RefitRoomRequest::default()
+    let request = pb::FitAdapterRequest {
+        room: room.name.clone(),
+        ..pb::FitAdapterRequest::default()
     };
-    let fitted = client.refit_room(request, |_| ()).await?.revision;
+    let fitted = client.fit_adapter(request, |_| ()).await?.revision;
     let fitted = fitted.unwrap_or_default();
     say(format_args!(
         "adapters/{}/revisions/{}: fitted to the room",
@@ -237,8 +261,8 @@ fn target(source: &ResourceName, renamed: Option<&str>) -> anyhow::Result<Resour
 fn room_messages(
     stored: &StoredRoom,
     upload: pb::RoomUpload,
-) -> anyhow::Result<Vec<pb::CreateRoomRequest>> {
-    use pb::create_room_request::Message;
+) -> anyhow::Result<Vec<pb::UploadRoomRequest>> {
+    use pb::upload_room_request::Message;
 
     if stored.features.is_empty() {
         bail!("the room has no features; compute them with `seese3 encode`");
@@ -270,7 +294,7 @@ fn room_messages(
 
     Ok(messages
         .into_iter()
-        .map(|message| pb::CreateRoomRequest {
+        .map(|message| pb::UploadRoomRequest {
             message: Some(message),
         })
         .collect())
@@ -305,30 +329,19 @@ fn batch(stored: &StoredRoom, rows: std::ops::Range<usize>) -> pb::FrameBatch {
         images: Vec::new(),
         timestamps_ns: part(&frames.timestamps_ns, &rows),
         frame_names: part(&frames.names, &rows),
-        sequences: part(&frames.sequences, &rows),
+        segments: part(&frames.sequences, &rows),
     }
 }
 
-fn adapter_messages(
-    manifest: Vec<u8>,
-    weights: &[u8],
-    target: &ResourceName,
-    validate_only: bool,
-) -> Vec<pb::PublishAdapterRequest> {
-    use pb::publish_adapter_request::Message;
+fn adapter_messages(upload: pb::AdapterUpload, weights: &[u8]) -> Vec<pb::UploadAdapterRequest> {
+    use pb::upload_adapter_request::Message;
 
-    let upload = pb::AdapterUpload {
-        name: target.to_string(),
-        manifest,
-        request_id: String::new(),
-        validate_only,
-    };
     let parts = weights.chunks(MESSAGE_BYTES);
     let parts = parts.map(|part| Message::Weights(part.to_vec()));
 
     std::iter::once(Message::Adapter(upload))
         .chain(parts)
-        .map(|message| pb::PublishAdapterRequest {
+        .map(|message| pb::UploadAdapterRequest {
             message: Some(message),
         })
         .collect()

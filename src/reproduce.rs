@@ -25,7 +25,7 @@ use seese3_store::{Store, StoredRoom};
 #[derive(Debug, Args)]
 pub struct Reproduce {
     /// The store
-    #[arg(long, env = "SEESE3_STORE")]
+    #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
     store: String,
     /// Rooms that one adapter is trained on together: names, or patterns with *
     #[arg(long, required = true)]

@@ -27,7 +27,7 @@ pub struct Serve {
     #[arg(long, value_name = "FILE", env = "SEESE3_CONFIG")]
     config: Option<PathBuf>,
     /// The store to serve: a folder, or a URL of a bucket (feature `cloud`)
-    #[arg(long, env = "SEESE3_STORE")]
+    #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
     store: String,
     /// Address to listen on, HOST:PORT; port 0 takes a free port
     #[arg(long, env = "SEESE3_LISTEN", default_value = "127.0.0.1:50051")]

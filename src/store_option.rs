@@ -5,10 +5,13 @@ use clap::Args;
 use super::output::JsonOutput;
 use seese3_store::Store;
 
+/// The store of a command without `--store` and without `SEESE3_STORE`.
+pub const DEFAULT_STORE: &str = "store";
+
 #[derive(Debug, Args)]
 pub struct StoreAndJson {
     /// The store: a folder, or a URL of a bucket (feature `cloud`)
-    #[arg(long, env = "SEESE3_STORE")]
+    #[arg(long, env = "SEESE3_STORE", default_value = DEFAULT_STORE)]
     pub store: String,
     #[command(flatten)]
     pub json: JsonOutput,

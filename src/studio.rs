@@ -37,8 +37,8 @@ const SHEET_SIZE: (usize, usize) = (160, 120);
 pub struct Studio {
     /// The store to publish the rooms in: a folder, created if it does not exist, or a URL of a
     /// bucket (feature `cloud`)
-    #[arg(long, env = "SEESE3_STORE", required_unless_present = "sheet")]
-    out: Option<String>,
+    #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
+    store: String,
     /// Kind of rooms and of their recordings
     #[arg(long, default_value = "visits", value_parser = one_of::<Suite>())]
     suite: Suite,
@@ -56,8 +56,8 @@ pub struct Studio {
     #[arg(long, default_value_t = 7)]
     seed: u64,
     /// Encoder of the images: an ONNX file, `pixels` or `builtin`
-    #[arg(long, value_name = "MODEL", default_value = "builtin")]
-    encode: String,
+    #[arg(long = "encoder", value_name = "MODEL", default_value = "builtin")]
+    model: String,
     #[command(flatten)]
     encoder: EncoderOptions,
     #[command(flatten)]
@@ -98,20 +98,20 @@ impl Studio {
             return self.sheet(file);
         }
 
-        let out = self.out()?;
+        let out = self.store.as_str();
 
         // Images are kept as plain files, which only a folder can hold.
         if self.keep_images && out.contains("://") {
             bail!("--keep-images needs a store that is a folder");
         }
 
-        let encoder = self.encoder.open(&self.encode, &self.runtime.runtime())?;
+        let encoder = self.encoder.open(&self.model, &self.runtime.runtime())?;
         if encoder.window() > 1 && self.keep_images {
             bail!("--keep-images draws single images; leave it out for an encoder of clips");
         }
 
         let store = Store::create(out)?;
-        let sources = encoder.sources(&feature_prefix(self.prefix.as_deref(), &self.encode));
+        let sources = encoder.sources(&feature_prefix(self.prefix.as_deref(), &self.model));
         check_names(&sources)?;
 
         // Rooms are rendered at the encoder's own input size, so that no image has to be resized.
@@ -224,10 +224,6 @@ impl Studio {
         Ok((drawn, there, spent))
     }
 
-    fn out(&self) -> anyhow::Result<&str> {
-        self.out.as_deref().context("--out DIR is required")
-    }
-
     fn frame_count(&self) -> usize {
         let default = match self.suite {
             Suite::Visits | Suite::Returns => 1_000,
@@ -277,7 +273,7 @@ impl Studio {
         // The root is absolute, so that `seese3 encode` finds the images from any working
         // directory.
         if self.keep_images {
-            let out = self.out()?;
+            let out = self.store.as_str();
             let root = Path::new(out)
                 .canonicalize()
                 .with_context(|| out.to_owned())?
@@ -350,7 +346,7 @@ impl Studio {
             return Ok(None);
         };
         let map = map_keypoints(room.poses(), &encoded.keypoints, camera)?;
-        room_keypoints(map, feature.clone(), outputs, &self.encode).map(Some)
+        room_keypoints(map, feature.clone(), outputs, &self.model).map(Some)
     }
 
     fn keep(&self, room: &Room, row: usize, drawn: &RgbImage) -> Result<(), Error> {

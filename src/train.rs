@@ -23,7 +23,7 @@ const MAX_SEEDS: u64 = 1_000;
 #[derive(Debug, Args)]
 pub struct Train {
     /// The store: a folder, or a URL of a bucket (feature `cloud`)
-    #[arg(long, env = "SEESE3_STORE")]
+    #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
     store: String,
     /// Training rooms: names, or patterns with *; may be given several times; one adapter is
     /// trained on all of them

@@ -2,7 +2,7 @@
 
 use clap::Args;
 
-use super::{Server, revision, wire_json};
+use super::{Server, revision_text, value_text, wire_json};
 use crate::output::{JsonOutput, say};
 use serde_json::json;
 
@@ -30,7 +30,7 @@ impl Catalog {
 
             say(format_args!(
                 "room {}: {} frames, features {}; adapters {}",
-                revision(room.revision.as_ref()),
+                revision_text(&room.name, room.revision),
                 room.frame_count,
                 features.join(", "),
                 room.adapters.join(", ")
@@ -47,9 +47,9 @@ impl Catalog {
 
             say(format_args!(
                 "adapter {}: preset {}, split {}, stride {}, test R² {r2}",
-                revision(adapter.revision.as_ref()),
+                revision_text(&adapter.name, adapter.revision),
                 adapter.preset,
-                adapter.split,
+                value_text(adapter.split().as_str_name(), "SPLIT_"),
                 adapter.stride
             ));
         }

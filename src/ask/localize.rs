@@ -15,14 +15,16 @@ use seese3_client::proto::v1 as pb;
 pub struct Localize {
     #[command(flatten)]
     server: Server,
-    /// A room to search; all rooms that the adapter fits if omitted; may be given several times
+    /// A room to search; all rooms that the adapter serves if omitted; may be given several times
     #[arg(long = "room")]
     rooms: Vec<String>,
-    /// Name of the adapter; may be omitted when only one fits all the rooms
-    #[arg(long, default_value = "")]
+    /// Name of the adapter. If omitted: with one room, as for `navigate`; otherwise the only one that
+    /// serves all the rooms; adapters fitted to one room do not count
+    #[arg(long, default_value = "", hide_default_value = true)]
     adapter: String,
-    /// Use this frame as the view: a row of the room, counted from 0; needs exactly one --room
-    #[arg(long, conflicts_with_all = ["feature", "image"])]
+    /// Use this stored frame as the view: a row of the room, counted from 0; exactly one room must be
+    /// searched
+    #[arg(long, conflicts_with_all = ["feature_file", "image"])]
     frame: Option<u32>,
     #[command(flatten)]
     feature: FeatureRow,
@@ -42,7 +44,7 @@ impl Localize {
         self.json.begin()?;
         let view = self.feature.or_frame(
             self.frame,
-            "--feature FILE --row ROW, --image FILE or --frame FRAME is required",
+            "--feature-file FILE --row ROW, --image FILE or --frame FRAME is required",
         )?;
 
         let request = pb::LocalizeRequest {
@@ -83,15 +85,15 @@ impl Localize {
         ));
 
         // Only a view that is a frame of the room has a recorded pose, and hence an error.
-        for place in &answer.places {
-            let frame = place
+        for similar in &answer.frames {
+            let frame = similar
                 .frame
                 .as_ref()
-                .context("the server's answer has a place without a frame")?;
+                .context("the server's answer has an entry of frames without a frame")?;
             say(format_args!(
                 "{}{}",
                 frame_text(frame),
-                place.error.as_ref().map_or(String::new(), error_text)
+                similar.error.as_ref().map_or(String::new(), error_text)
             ));
         }
 

@@ -4,6 +4,7 @@ mod catalog;
 mod localize;
 mod motion;
 mod navigate;
+mod plan;
 mod relocalize;
 mod wire_json;
 
@@ -13,6 +14,7 @@ pub use motion::Motion;
 pub use navigate::Navigate;
 #[cfg(feature = "lab")]
 pub use navigate::say_navigation;
+pub use plan::Plan;
 pub use relocalize::Relocalize;
 pub use wire_json::wire_json;
 
@@ -96,12 +98,12 @@ impl Server {
 #[derive(Debug, Args)]
 struct FeatureRow {
     /// A JPEG or PNG file; the server must have been started with --encoder
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["feature", "row"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["feature_file", "row"])]
     image: Option<PathBuf>,
     /// A NumPy file of features, shape (n, d); --row chooses one
     #[arg(long, value_name = "FILE", requires = "row")]
-    feature: Option<PathBuf>,
-    /// The row of the --feature file, counted from 0
+    feature_file: Option<PathBuf>,
+    /// The row of the --feature-file, counted from 0
     #[arg(long)]
     row: Option<usize>,
 }
@@ -109,8 +111,8 @@ struct FeatureRow {
 impl FeatureRow {
     /// The view: a frame of the room if one is given, else the image or the feature.
     fn or_frame(&self, frame: Option<u32>, missing: &'static str) -> anyhow::Result<pb::View> {
-        match (frame, &self.image, &self.feature, self.row) {
-            (_, _, None, Some(_)) => bail!("--row needs --feature FILE"),
+        match (frame, &self.image, &self.feature_file, self.row) {
+            (_, _, None, Some(_)) => bail!("--row needs --feature-file FILE"),
             (Some(frame), ..) => Ok(frame_view(frame)),
             (_, Some(file), ..) => image_view(file),
             (_, _, Some(file), Some(row)) => feature_view(file, row),
@@ -187,11 +189,20 @@ fn fitted_text(fitted: &pb::FittedEstimate) -> String {
         "from frame {}, distance {:.3}: translation {} × {:.1}, rotation {} × {:.1}",
         fitted.frame_id,
         fitted.distance,
-        fitted.translation_reader,
+        estimator_text(fitted.translation_estimator()),
         fitted.translation_gain,
-        fitted.rotation_reader,
+        estimator_text(fitted.rotation_estimator()),
         fitted.rotation_gain
     )
+}
+
+fn estimator_text(estimator: pb::RelativeEstimator) -> &'static str {
+    match estimator {
+        pb::RelativeEstimator::Unspecified => "unknown",
+        pb::RelativeEstimator::Fitted => "fitted",
+        pb::RelativeEstimator::ZeroShot => "zero-shot",
+        pb::RelativeEstimator::NearestFrame => "nearest frame",
+    }
 }
 
 fn feature_view(file: &Path, row: usize) -> anyhow::Result<pb::View> {
@@ -231,26 +242,13 @@ fn frame_view(frame: u32) -> pb::View {
 }
 
 fn error_text(error: &pb::PoseError) -> String {
-    let checks: Vec<String> = error
-        .thresholds
-        .iter()
-        .map(|check| {
-            format!(
-                "@{} {}",
-                check.threshold,
-                if check.met { "hit" } else { "miss" }
-            )
-        })
-        .collect();
-
     // ‖Δ‖ is the norm of the difference between the wanted and the retrieved motion, meters and
     // radians mixed: Hit@ε compares it with ε.
     format!(
-        "  error {:.3} m {:.2}°, ‖Δ‖ {:.3} ({})",
+        "  error {:.3} m {:.2}°, ‖Δ‖ {:.3}",
         error.translation_m,
         error.rotation_rad.to_degrees(),
         error.twist_norm,
-        checks.join(", ")
     )
 }
 
@@ -269,8 +267,8 @@ fn pose_text(pose: Option<&pb::Pose>) -> String {
     let q = pose.orientation.unwrap_or_default();
 
     format!(
-        "({:.3}, {:.3}, {:.3}) m, wxyz ({:.3}, {:.3}, {:.3}, {:.3}) in {}",
-        p.x, p.y, p.z, q.w, q.x, q.y, q.z, pose.parent_frame
+        "({:.3}, {:.3}, {:.3}) m, xyzw ({:.3}, {:.3}, {:.3}, {:.3}) in {}",
+        p.x, p.y, p.z, q.x, q.y, q.z, q.w, pose.parent_frame
     )
 }
 
@@ -305,8 +303,17 @@ fn motion_text(motion: &pb::Twist) -> String {
 
 fn revision(revision: Option<&pb::Revision>) -> String {
     revision.map_or(String::new(), |revision| {
-        format!("'{}' revision {}", revision.name, revision.revision)
+        revision_text(&revision.name, revision.revision)
     })
+}
+
+fn revision_text(name: &str, revision: u64) -> String {
+    format!("'{name}' revision {revision}")
+}
+
+/// The name of an enum's value without the name of the enum, in small letters.
+fn value_text(name: &str, of: &str) -> String {
+    name.trim_start_matches(of).to_lowercase().replace('_', "-")
 }
 
 /// The diagonal of a row-major 6×6 matrix; `None` for another length.

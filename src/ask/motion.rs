@@ -18,28 +18,26 @@ use seese3_server::camera_to_wire;
 pub struct Motion {
     #[command(flatten)]
     server: Server,
-    /// Name of the adapter; may be omitted when a room is named or the server has only one adapter
-    #[arg(long, default_value = "")]
+    /// Name of the adapter. If omitted: with a room, as for `navigate`; otherwise the only one that
+    /// serves all rooms; adapters fitted to one room do not count
+    #[arg(long, default_value = "", hide_default_value = true)]
     adapter: String,
     /// Name of the room that the frames belong to
-    #[arg(long, default_value = "")]
+    #[arg(long, default_value = "", hide_default_value = true)]
     room: String,
     /// First frame: a row of the room, counted from 0
-    #[arg(long, requires = "to", conflicts_with_all = ["frames", "images", "feature"])]
+    #[arg(long, requires = "to", conflicts_with_all = ["images", "feature_file"])]
     from: Option<u32>,
     /// Second frame: a row of the room, counted from 0
     #[arg(long, requires = "from")]
     to: Option<u32>,
-    /// Both frames in one option, A,B
+    /// Two JPEG or PNG files, A,B; the server must have been started with --encoder
     #[arg(
         long,
         value_delimiter = ',',
         value_name = "A,B",
-        conflicts_with = "feature"
+        conflicts_with = "feature_file"
     )]
-    frames: Option<Vec<u32>>,
-    /// Two JPEG or PNG files, A,B; the server must have been started with --encoder
-    #[arg(long, value_delimiter = ',', value_name = "A,B", conflicts_with_all = ["frames", "feature"])]
     images: Option<Vec<PathBuf>>,
     /// Camera of --images, as --camera of `seese3 import`. With it, a server with the encoder of a
     /// room's keypoints matches the keypoints of the images, unless --adapter is given
@@ -47,8 +45,8 @@ pub struct Motion {
     camera: Option<CameraOption>,
     /// A NumPy file of features, shape (n, d); --rows chooses two
     #[arg(long, value_name = "FILE", requires = "rows")]
-    feature: Option<PathBuf>,
-    /// Two rows of the --feature file, A,B, counted from 0
+    feature_file: Option<PathBuf>,
+    /// Two rows of the --feature-file, A,B, counted from 0
     #[arg(long, value_delimiter = ',', value_name = "A,B")]
     rows: Option<Vec<usize>>,
     #[command(flatten)]
@@ -60,19 +58,21 @@ impl Motion {
     fn views(&self) -> anyhow::Result<(pb::View, pb::View)> {
         // Both views come from one kind of input: frames of a room, rows of a feature file, or
         // image files.
-        let frames = match self.from.zip(self.to) {
-            Some((from, to)) => Some(vec![from, to]),
-            None => self.frames.clone(),
-        };
-        match (frames.as_deref(), &self.feature, self.rows.as_deref()) {
-            (Some(&[a, b]), _, _) => Ok((frame_view(a), frame_view(b))),
+        match (
+            self.from.zip(self.to),
+            &self.feature_file,
+            self.rows.as_deref(),
+        ) {
+            (Some((from, to)), _, _) => Ok((frame_view(from), frame_view(to))),
             (None, Some(file), Some(&[a, b])) => {
                 Ok((feature_view(file, a)?, feature_view(file, b)?))
             }
             _ => match self.images.as_deref() {
                 Some([a, b]) => Ok((image_view(a)?, image_view(b)?)),
                 _ => {
-                    bail!("--from A --to B, --feature FILE --rows A,B or --images A,B is required")
+                    bail!(
+                        "--from A --to B, --feature-file FILE --rows A,B or --images A,B is required"
+                    )
                 }
             },
         }
@@ -101,17 +101,17 @@ impl Motion {
             .await?
             .estimate_motion(request)
             .await?;
-        let motion = answer
-            .motion
-            .as_ref()
-            .context("the server sent no motion")?;
+        let motion = answer.motion.as_ref();
+        let motion = motion.context("the server sent no motion")?;
+        let twist = motion.twist.as_ref();
+        let twist = twist.context("the server sent no motion")?;
 
-        match answer.reader() {
-            pb::MotionReader::TwoView => say("estimated by matched keypoints"),
-            pb::MotionReader::None => {
+        match answer.estimator() {
+            pb::MotionEstimator::TwoView => say("estimated by matched keypoints"),
+            pb::MotionEstimator::None => {
                 say("the images have too little in common: no motion was estimated");
             }
-            pb::MotionReader::Adapter | pb::MotionReader::Unspecified => say(format_args!(
+            pb::MotionEstimator::Adapter | pb::MotionEstimator::Unspecified => say(format_args!(
                 "adapter {}",
                 revision(answer.adapter.as_ref())
             )),
@@ -119,11 +119,11 @@ impl Motion {
 
         say(format_args!(
             "motion {} in the body frame of the first camera",
-            motion_text(motion)
+            motion_text(twist)
         ));
 
         // Standard deviation per axis: the root of the mean of three variances.
-        if let Some(variances) = diagonal(&answer.covariance) {
+        if let Some(variances) = diagonal(&motion.covariance) {
             let deviation = |part: &[f64]| (part.iter().sum::<f64>() / 3.0).sqrt();
             say(format_args!(
                 "standard deviation {:.3} m, {:.1}° per axis",

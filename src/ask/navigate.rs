@@ -17,20 +17,25 @@ pub struct Navigate {
     /// Name of the room to navigate in
     #[arg(long)]
     room: String,
-    /// Name of the adapter; if empty, the default of the room: one fitted to it, else one trained
-    /// in it, else the newest that fits
-    #[arg(long, default_value = "")]
+    /// Name of the adapter. If omitted: the room's default (`seese3 store default`), else one fitted
+    /// to the room, else one trained in it, else the newest that serves it
+    #[arg(long, default_value = "", hide_default_value = true)]
     adapter: String,
     /// Start at this frame of the room (its row, counted from 0)
-    #[arg(long, conflicts_with_all = ["feature", "image"])]
+    #[arg(long, conflicts_with_all = ["feature_file", "image"])]
     from: Option<u32>,
     #[command(flatten)]
     feature: FeatureRow,
     /// Target frame of the room: the motion is computed from the recorded poses
-    #[arg(long, conflicts_with = "twist")]
+    #[arg(
+        long,
+        value_name = "FRAME",
+        requires = "from",
+        conflicts_with = "twist"
+    )]
     to: Option<u32>,
     /// The motion as vx,vy,vz,wx,wy,wz (se(3) twist), meters and radians, in the body frame of the
-    /// start camera (x right, y down, z forward)
+    /// start camera (x right, y down, z forward): the whole motion, which --steps divides
     #[arg(long, value_delimiter = ',', allow_hyphen_values = true)]
     twist: Option<Vec<f64>>,
     /// Number of equal steps that the motion is divided into
@@ -41,11 +46,11 @@ pub struct Navigate {
     mode: Mode,
     /// How the mean μ and deviation σ of the training motions enter the inverse of W; homogeneous
     /// if neither this nor --navigator is given
-    #[arg(long, value_parser = one_of::<Reading>(), conflicts_with = "navigator")]
+    #[arg(long = "inverse", value_name = "VARIANT", value_parser = one_of::<Reading>(), conflicts_with = "navigator")]
     reading: Option<Reading>,
     /// Navigator by name, instead of inverse Poincaré: corrector-mlp-3, ridge-refit,
-    /// inverse-poincare-affine+motion, …; if empty, inverse Poincaré in the given --reading
-    #[arg(long, default_value = "")]
+    /// inverse-poincare-affine+motion, …; if empty, inverse Poincaré in the given --inverse
+    #[arg(long, default_value = "", hide_default_value = true)]
     navigator: String,
     /// Number of nearest frames returned for each step
     #[arg(long, default_value_t = 1)]
@@ -66,7 +71,7 @@ impl Navigate {
         // A navigation starts from exactly one view. Clap rejects two; reject none here.
         let source = self.feature.or_frame(
             self.from,
-            "--from FRAME, --feature FILE --row ROW or --image FILE is required",
+            "--from FRAME, --feature-file FILE --row ROW or --image FILE is required",
         )?;
 
         let displacement = match (self.to, &self.twist) {
@@ -76,22 +81,20 @@ impl Navigate {
         };
 
         let mode = match self.mode {
-            Mode::OpenLoop => pb::Mode::OpenLoop,
-            Mode::Snap => pb::Mode::Snap,
-            Mode::ClosedLoop => pb::Mode::ClosedLoop,
+            Mode::OpenLoop => pb::StepMode::OpenLoop,
+            Mode::Snap => pb::StepMode::Snap,
+            Mode::ClosedLoop => pb::StepMode::ClosedLoop,
         };
 
-        // An unspecified reading leaves the choice to the server: homogeneous, unless --navigator
+        // An unspecified variant leaves the choice to the server: homogeneous, unless --navigator
         // already names one.
-        let reading = match self.reading {
-            None => pb::Reading::Unspecified,
-            Some(Reading::Affine) => pb::Reading::Affine,
-            Some(Reading::Homogeneous) => pb::Reading::Homogeneous,
-            Some(Reading::Literal) => pb::Reading::Literal,
+        let variant = match self.reading {
+            None => pb::InverseVariant::Unspecified,
+            Some(Reading::Affine) => pb::InverseVariant::Affine,
+            Some(Reading::Homogeneous) => pb::InverseVariant::Homogeneous,
+            Some(Reading::Literal) => pb::InverseVariant::Literal,
         };
 
-        // Fields left at their defaults are filled in by the server, the thresholds of Hit@ε
-        // among them.
         let request = pb::NavigateRequest {
             room: self.room,
             adapter: self.adapter,
@@ -100,8 +103,8 @@ impl Navigate {
                 displacement: Some(displacement),
             }),
             steps: Some(self.steps),
-            mode: mode.into(),
-            reading: reading.into(),
+            step_mode: mode.into(),
+            inverse_variant: variant.into(),
             navigator: self.navigator,
             top_k: Some(self.top_k),
             exclude_source: self.exclude_source,

@@ -16,11 +16,11 @@ use seese3_client::proto::v1 as pb;
 pub struct Relocalize {
     #[command(flatten)]
     server: Server,
-    /// A room to search; all rooms that the adapter fits if omitted; may be given several times
+    /// A room to search; all rooms that the adapter serves if omitted; may be given several times
     #[arg(long = "room")]
     rooms: Vec<String>,
-    /// Name of the adapter; may be omitted when only one that can track fits the rooms
-    #[arg(long, default_value = "")]
+    /// Name of the adapter; may be omitted when only one that can track serves the rooms
+    #[arg(long, default_value = "", hide_default_value = true)]
     adapter: String,
     /// JPEG or PNG files, A,B,…: views of one camera that hardly moves between them, the newest
     /// last; the server must have been started with --encoder
@@ -28,7 +28,7 @@ pub struct Relocalize {
         long,
         value_delimiter = ',',
         value_name = "A,B,…",
-        conflicts_with = "features"
+        conflicts_with = "feature_file"
     )]
     images: Vec<PathBuf>,
     /// Camera of --images, as --camera of `seese3 import`, or "mapping" for the camera that mapped
@@ -37,13 +37,13 @@ pub struct Relocalize {
     camera: Option<ViewCamera>,
     /// A NumPy file of features, shape (n, d); --rows chooses some
     #[arg(long, value_name = "FILE", requires = "rows")]
-    features: Option<PathBuf>,
-    /// Rows of the --features file, A,B,…, counted from 0, the newest last
+    feature_file: Option<PathBuf>,
+    /// Rows of the --feature-file, A,B,…, counted from 0, the newest last
     #[arg(
         long,
         value_delimiter = ',',
         value_name = "A,B,…",
-        requires = "features"
+        requires = "feature_file"
     )]
     rows: Vec<usize>,
     /// Maximum number of rooms returned; all are compared
@@ -56,14 +56,14 @@ pub struct Relocalize {
 impl Relocalize {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
-        let views = match &self.features {
+        let views = match &self.feature_file {
             Some(file) => {
                 let rows = self.rows.iter();
                 rows.map(|row| feature_view(file, *row))
                     .collect::<anyhow::Result<_>>()?
             }
             None if self.images.is_empty() => {
-                bail!("--images A,B,… or --features FILE --rows A,B,… is required")
+                bail!("--images A,B,… or --feature-file FILE --rows A,B,… is required")
             }
             None => {
                 let images = self.images.iter();
@@ -78,8 +78,8 @@ impl Relocalize {
             adapter: self.adapter,
             views,
             max_rooms: Some(self.max_rooms),
-            top_k: None,
             camera: self.camera.map(ViewCamera::to_wire),
+            ..pb::RelocalizeRequest::default()
         };
         let answer = self.server.connect().await?.relocalize(request).await?;
 

@@ -19,7 +19,11 @@ const BATCH: usize = 8;
 #[derive(Debug, Args)]
 pub struct KeypointViews {
     /// ONNX file of the encoder with keypoints; by default the file that the room was encoded with
-    #[arg(long, value_name = "FILE", conflicts_with = "adapter")]
+    #[arg(
+        long = "keypoint-encoder",
+        value_name = "FILE",
+        conflicts_with = "adapter"
+    )]
     pub model: Option<PathBuf>,
     /// Folder of the images; by default that of the import. Without an adapter, rooms of `seese3
     /// studio` are drawn again

@@ -36,7 +36,7 @@ const PEER_WIDTH: usize = 640;
 #[derive(Debug, Args)]
 pub struct Localization {
     /// The store
-    #[arg(long, env = "SEESE3_STORE")]
+    #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
     store: String,
     /// The room
     #[arg(long)]

@@ -106,7 +106,7 @@ impl Evaluate {
 #[derive(Debug, Args)]
 struct Navigation {
     /// The store
-    #[arg(long, env = "SEESE3_STORE")]
+    #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
     store: String,
     /// The room
     #[arg(long)]
@@ -218,15 +218,15 @@ impl Navigation {
 
         progress.finish_and_clear();
 
-        // A curve has more thresholds than the table.
-        let curves = report;
-        let report = report_at(&curves, &self.thresholds);
-
         let trained_on = store
             .trained_on(&record, navigator.room().id(), stored.revision)
             .await?;
         let in_room = trained_on != TrainedOn::Nothing;
         let leak = Leak::of(&record, trained_on, protocol.split);
+
+        // A curve has more thresholds than the table.
+        let curves = report.marked(leak, is_calibrated_in(&record, navigator.room().id()));
+        let report = report_at(&curves, &self.thresholds);
 
         say(format_args!(
             "room '{}' revision {}, features '{features_name}', adapter '{}' revision {} ({})",
@@ -316,7 +316,7 @@ impl Navigation {
             let mut drawn = hit_curves(curves, title);
             if self.navigators.is_empty() {
                 // Other retrieval metrics and in-sample navigators would hide the other curves.
-                let is_plain = |name: &str| !name.contains('+') && !name.ends_with("-in-sample");
+                let is_plain = |name: &str| !name.contains('+') && !name.contains("-in-sample");
                 drawn.series.retain(|series| is_plain(&series.name));
             }
             write_file(file, &drawn.svg()?)?;
@@ -426,7 +426,7 @@ async fn choose(store: &Store, wanted: &Navigation) -> anyhow::Result<StoredAdap
     }
     if sources.is_empty() {
         bail!(
-            "room '{}' has no features{}; encode its images first: `seese3 encode --store {} --room {} --model MODEL`",
+            "room '{}' has no features{}; encode its images first: `seese3 encode --store {} --room {} --encoder MODEL`",
             wanted.room,
             wanted
                 .features

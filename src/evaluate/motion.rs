@@ -16,7 +16,7 @@ use seese3_store::{Store, StoredAdapter};
 #[derive(Debug, Args)]
 pub struct Motion {
     /// The store
-    #[arg(long, env = "SEESE3_STORE")]
+    #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
     store: String,
     /// The room
     #[arg(long)]

@@ -18,7 +18,7 @@ use seese3_store::Store;
 #[derive(Debug, Args)]
 pub struct Planning {
     /// The store
-    #[arg(long, env = "SEESE3_STORE")]
+    #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
     store: String,
     /// The rooms: names, or patterns with *
     #[arg(long = "room", required = true)]

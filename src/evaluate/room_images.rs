@@ -93,7 +93,7 @@ pub fn keypoint_model(given: Option<&Path>, recorded: &str) -> anyhow::Result<Pa
     let file = given.map_or_else(|| PathBuf::from(recorded), Path::to_owned);
     if !file.is_file() {
         bail!(
-            "'{}' is not a file; give the model that the room was encoded with by --model FILE",
+            "'{}' is not a file; give the model that the room was encoded with by --keypoint-encoder FILE",
             file.display()
         );
     }

@@ -12,19 +12,19 @@ use crate::encode::same_poses;
 use crate::encoder::say_features;
 use crate::output::{JsonOutput, say};
 use crate::pose_options::{DirectionName, PoseOptions};
-use crate::pose_report::{PosesFrom, check_with_images, report_json, say_report};
+use crate::pose_report::{PosesFrom, check_with_images, contradiction, report_json, say_report};
 use crate::progress::bar;
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_data::datasets::{self, Reader, Recording, Unusable};
-use seese3_data::pose_check::check_room;
+use seese3_data::pose_check::{PoseReport, check_room};
 use seese3_store::{Store, check_features};
 
 #[derive(Debug, Args)]
 pub struct Destination {
     /// The store: a folder, created if it does not exist, or a URL of a bucket
     /// (feature `cloud`)
-    #[arg(long, env = "SEESE3_STORE")]
+    #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
     store: String,
     /// Name of the room in the store; if omitted, the name in an exported bundle, else derived from
     /// the path
@@ -34,21 +34,24 @@ pub struct Destination {
     #[arg(long, value_name = "K", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
     /// Fail and publish nothing, instead of warning. Reasons: an unusable frame; an unreadable
-    /// image; wrong poses (contradicted by the images, all identical, identities from lost
-    /// tracking, steps too long for meters, timestamps that do not increase)
+    /// image; implausible poses (all identical, identities from lost tracking, steps too long for
+    /// meters, timestamps that do not increase)
     #[arg(long)]
     strict: bool,
     /// Publish a new revision even if the store has a room of this name with other frames; the
     /// features of the old frames are not carried over
     #[arg(long)]
     replace: bool,
+    /// Publish the room although its images contradict its poses
+    #[arg(long, conflicts_with = "strict")]
+    allow_contradicted: bool,
     /// Features, NAME=FILE.npy, shape (n, d): one row for each usable frame, also for those that
     /// --every leaves out; may be given several times
     #[arg(long = "features", value_name = "NAME=FILE")]
     features: Vec<String>,
     /// License of the recording, stored with the room
-    #[arg(long, default_value = "")]
-    licence: String,
+    #[arg(long, default_value = "", hide_default_value = true)]
+    license: String,
     /// Camera of the images, in pixels; needed for motion estimation between two images. FOCAL may
     /// be FX,FY if CX,CY follow. LENS is k1=N,k2=N,p1=N,p2=N,k3=N (Brown–Conrady; coefficients of 0
     /// may be omitted) or fisheye=K1:K2:K3:K4 (Kannala–Brandt)
@@ -88,6 +91,49 @@ impl Destination {
         );
     }
 
+    /// Rejects poses that the images contradict, unless --allow-contradicted was given. `advice`
+    /// says what to do about them.
+    async fn refuse_contradicted(
+        &self,
+        store: &Store,
+        room: &Room,
+        advice: Option<String>,
+    ) -> anyhow::Result<()> {
+        let Some(advice) = advice.filter(|_| !self.allow_contradicted) else {
+            return Ok(());
+        };
+
+        // A corrected import has other poses: a room that is there already has to be replaced.
+        let is_stored = store.load_room(room.id().as_str(), None).await.is_ok();
+        let replace = if is_stored {
+            "; the room is in the store, so add --replace"
+        } else {
+            ""
+        };
+        bail!(
+            "the images contradict the poses of room '{}'; nothing was published. Remedy: {advice}{replace}. \
+             If the poses are right, give --allow-contradicted",
+            room.id()
+        );
+    }
+
+    /// Rejects unreadable images and implausible poses, with --strict.
+    fn refuse_if_strict(&self, room: &Room, report: &PoseReport) -> anyhow::Result<()> {
+        if self.strict && report.has_unreadable_images() {
+            bail!(
+                "images of room '{}' cannot be read, see the warnings; nothing was published (--strict)",
+                room.id()
+            );
+        }
+        if self.strict && report.is_wrong() {
+            bail!(
+                "the poses of room '{}' are wrong, see the warnings; nothing was published (--strict)",
+                room.id()
+            );
+        }
+        Ok(())
+    }
+
     /// Checks, before the work, that the results can be written.
     pub fn begin(&self) -> anyhow::Result<()> {
         self.json.begin()
@@ -123,7 +169,7 @@ impl Destination {
     }
 
     /// The room of a recording. An exported bundle states its name, format and license: the
-    /// original format is kept, and --licence and --name override the stated values.
+    /// original format is kept, and --license and --name override the stated values.
     fn room(
         &self,
         format: &str,
@@ -141,7 +187,7 @@ impl Destination {
         };
         let provenance = Provenance {
             format: either(&stated.format, format),
-            licence: either(&self.licence, &stated.licence),
+            licence: either(&self.license, &stated.licence),
             images_root: recording.images_root.clone(),
             worst_rotation_deviation: recording.worst_rotation_deviation,
             camera: self
@@ -268,18 +314,9 @@ impl Destination {
             );
         }
 
-        if self.strict && report.has_unreadable_images() {
-            bail!(
-                "images of room '{}' cannot be read, see the warnings; nothing was published (--strict)",
-                room.id()
-            );
-        }
-        if self.strict && report.is_wrong() {
-            bail!(
-                "the poses of room '{}' are wrong, see the warnings; nothing was published (--strict)",
-                room.id()
-            );
-        }
+        self.refuse_contradicted(&store, &room, contradiction(&report, from))
+            .await?;
+        self.refuse_if_strict(&room, &report)?;
         let published = match self.replace {
             true => store.publish_room(&room, &features).await?,
             false => store.publish_same_frames(&room, &features).await?,

@@ -30,7 +30,7 @@ const SHOWN: usize = 10;
 #[derive(Debug, Args)]
 pub struct Adapters {
     /// The store
-    #[arg(long, env = "SEESE3_STORE")]
+    #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
     store: String,
     /// The rooms, each trained on separately: names, or patterns with *
     #[arg(long = "room", required = true)]

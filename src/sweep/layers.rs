@@ -22,7 +22,7 @@ use seese3_store::{Store, StoredRoom};
 #[derive(Debug, Args)]
 pub struct Layers {
     /// The store
-    #[arg(long, env = "SEESE3_STORE")]
+    #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
     store: String,
     /// The room; give it several times for means over rooms
     #[arg(long = "room", required = true)]

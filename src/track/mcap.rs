@@ -24,14 +24,16 @@ pub fn recorded(heard: &ReceivedAnswers, seen: &[RecordedView]) -> anyhow::Resul
         if let Some(pose) = map(update) {
             recording.pose("/pose", time, &names.map, &pose)?;
 
-            let velocity = update.body_velocity.as_ref();
+            let camera = update.camera.clone().unwrap_or_default();
+            let velocity = camera.velocity.and_then(|velocity| velocity.twist);
+            let covariance = camera.map_pose.map(|pose| pose.covariance);
             let odometry = RecordedOdometry {
                 frame: &names.map,
                 child_frame: &names.camera,
                 pose,
-                covariance: &update.map_from_camera_covariance,
+                covariance: &covariance.unwrap_or_default(),
                 velocity: velocity.and_then(|wire| {
-                    let convert::Twist { linear, angular } = convert::twist(wire).ok()?;
+                    let convert::Twist { linear, angular } = convert::twist(&wire).ok()?;
                     Some(Twist { linear, angular })
                 }),
             };
@@ -39,7 +41,7 @@ pub fn recorded(heard: &ReceivedAnswers, seen: &[RecordedView]) -> anyhow::Resul
         }
 
         // The sequence number identifies the input row, and hence the image file.
-        let row = usize::try_from(update.sequence)
+        let row = usize::try_from(update.sequence_number)
             .unwrap_or(usize::MAX)
             .saturating_sub(1);
         if let Some(RecordedView::Image(file)) = seen.get(row) {

@@ -28,20 +28,20 @@ const WAITING: usize = 32;
 pub struct Track {
     #[command(flatten)]
     server: Server,
-    /// Name of the room; if omitted, the server finds it among all rooms that the adapter fits or,
+    /// Name of the room; if omitted, the server finds it among all rooms that the adapter serves or,
     /// for images if no adapter can track, among all rooms with keypoints
     #[arg(long)]
     room: Option<String>,
-    /// Name of the adapter; if omitted, the newest that can track in the room, or without a room
-    /// the only one that can track. If none can, images are tracked by their keypoints
+    /// Name of the adapter. If omitted: in a named room, the first by the rule of `navigate` that can
+    /// track; without a room, the only one that can. If none can, images are tracked by keypoints
     #[arg(long)]
     adapter: Option<String>,
     /// A NumPy file of features, shape (n, d), one row per frame
     #[arg(long, value_name = "FILE", required_unless_present = "images")]
-    feature: Option<PathBuf>,
+    feature_file: Option<PathBuf>,
     /// A folder of JPEG or PNG files, one per frame, in the order of their names; the server must
     /// have been started with --encoder
-    #[arg(long, value_name = "FOLDER", conflicts_with = "feature")]
+    #[arg(long, value_name = "FOLDER", conflicts_with = "feature_file")]
     images: Option<PathBuf>,
     /// Camera of --images, as --camera of `seese3 import`, or "mapping" for the camera that mapped
     /// the room. In a room with keypoints, the focal length of an unknown camera is estimated
@@ -49,13 +49,13 @@ pub struct Track {
     camera: Option<ViewCamera>,
     /// First frame to send, counted from 0
     #[arg(long, default_value_t = 0)]
-    from: usize,
+    first: usize,
     /// Number of frames to send; all remaining ones if omitted
     #[arg(long)]
     count: Option<usize>,
-    /// Frame rate, frames per second: frame i gets the timestamp i / hz seconds
+    /// Frame rate, frames per second: frame i gets the timestamp i / rate seconds
     #[arg(long, default_value_t = 30.0)]
-    hz: f64,
+    rate: f64,
     /// Dead reckoning only: no drift correction from the map
     #[arg(long)]
     no_fusion: bool,
@@ -110,17 +110,17 @@ impl Track {
             check_writable(path)?;
         }
 
-        if !(self.hz.is_finite() && self.hz > 0.0) {
-            bail!("--hz must be above 0, got {}", self.hz);
+        if !(self.rate.is_finite() && self.rate > 0.0) {
+            bail!("--rate must be above 0, got {}", self.rate);
         }
 
         let views = self.views()?;
-        if self.from >= views.len() {
-            bail!("--from {}: there are {} frames", self.from, views.len());
+        if self.first >= views.len() {
+            bail!("--first {}: there are {} frames", self.first, views.len());
         }
 
         let end = self.count.map_or(views.len(), |count| {
-            self.from.saturating_add(count).min(views.len())
+            self.first.saturating_add(count).min(views.len())
         });
 
         let config = self.config()?;
@@ -130,8 +130,8 @@ impl Track {
         let client = self.server.connect().await?;
         let (sender, requests) = tokio::sync::mpsc::channel(WAITING);
 
-        let from = self.from;
-        let hz = self.hz;
+        let from = self.first;
+        let hz = self.rate;
 
         // A separate task sends the frames while this one reads answers: with unread answers, the
         // server would stop accepting frames.
@@ -233,7 +233,7 @@ impl Track {
     }
 
     fn views(&self) -> anyhow::Result<Vec<RecordedView>> {
-        if let Some(file) = &self.feature {
+        if let Some(file) = &self.feature_file {
             return Ok(read_features(file)?
                 .outer_iter()
                 .map(|row| RecordedView::Feature(row.to_vec()))
@@ -243,7 +243,7 @@ impl Track {
         let folder = self
             .images
             .as_ref()
-            .context("give --feature FILE or --images FOLDER")?;
+            .context("give --feature-file FILE or --images FOLDER")?;
         let entries = std::fs::read_dir(folder)
             .with_context(|| format!("{} cannot be read", folder.display()))?;
 
@@ -332,7 +332,7 @@ impl Track {
                 // Sequence numbers start at 1, rows of the input at 0.
                 say(format_args!(
                     "frame {}: {status}{place}: {}",
-                    update.sequence.saturating_sub(1),
+                    update.sequence_number.saturating_sub(1),
                     one_line(&update.reason)
                 ));
 
@@ -416,7 +416,7 @@ fn frame(row: usize, view: pb::view::View, hz: f64) -> pb::TrackFrame {
     let view = Some(pb::View { view: Some(view) });
     pb::TrackFrame {
         timestamp_ns: (row as f64 / hz * 1e9) as i64,
-        sequence: row as u64 + 1,
+        sequence_number: row as u64 + 1,
         view,
         ..pb::TrackFrame::default()
     }
@@ -425,11 +425,11 @@ fn frame(row: usize, view: pb::view::View, hz: f64) -> pb::TrackFrame {
 type PoseOf = fn(&pb::TrackUpdate) -> Option<Pose>;
 
 fn map(update: &pb::TrackUpdate) -> Option<Pose> {
-    plain(update.map_from_camera.clone())
+    plain(update.map_from_camera().cloned())
 }
 
 fn odom(update: &pb::TrackUpdate) -> Option<Pose> {
-    plain(update.odom_from_camera.clone())
+    plain(update.odom_from_camera().cloned())
 }
 
 /// Converts a pose without checking its frame names, which the caller knows.

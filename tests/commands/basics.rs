@@ -72,7 +72,11 @@ fn import_train_and_evaluate_write_what_scripts_read() {
 
     for row in navigators {
         assert_eq!(row["n"], 100);
-        assert!(row["mse"].is_number() && row["r2"].is_number() && row["top1"].is_number());
+        assert!(
+            row["latent_mse"].is_number()
+                && row["latent_r2"].is_number()
+                && row["top1"].is_number()
+        );
 
         for epsilon in ["0.1", "0.2", "0.3", "0.5"] {
             let hit = |key: &str| number(&row["hit"][epsilon][key]);
@@ -132,9 +136,26 @@ fn a_served_room_is_asked_and_the_server_stops_when_told() {
         &["step 2  frame     7  distance 0.0000"],
     );
 
-    let feature = "--feature golden/rooms/synthetic/features.npy";
+    let feature = "--feature-file golden/rooms/synthetic/features.npy";
     let place = format!("localize --room r {feature} --row 11 --top-k 1 {to}");
     here.prints(&place, &["frame    11  distance 0.0000"]);
+
+    // Oracle: the definition: a route that is found ends within 0.25 m of the goal.
+    let plan = format!("plan --room r --from 7 --json - {to}");
+    let route: serde_json::Value =
+        serde_json::from_str(&here.succeeds(&format!("{plan} --to 43"))).unwrap();
+    assert_eq!(route["outcome"], "ROUTE_OUTCOME_FOUND");
+    let last = route["hops"].as_array().unwrap().last().unwrap();
+    assert!(
+        last["distance_remaining_m"].as_f64().unwrap() <= 0.25,
+        "{last}"
+    );
+    let unmapped = format!("plan --room r --from 7 --to-pose 90,0,0,0,0,0,1 {to}");
+    here.prints(&unmapped, &["goal-not-mapped"]);
+    here.refuses(
+        &format!("plan --room r --from 7 --to-pose 1,2 {to}"),
+        &["seven numbers"],
+    );
 
     // The same two views, as rows of the file and as frames of the room that was made of it.
     let of_rows = format!("motion {feature} --rows 3,43");
@@ -206,7 +227,7 @@ fn bad_input_gets_one_line() {
         ],
     );
 
-    here.refuses(evaluate, &["no adapter was trained on room 'r'"]);
+    here.refuses(evaluate, &["no adapter serves room 'r'", "seese3 train"]);
     here.refuses(
         "evaluate --store store --room NOPE",
         &["room 'NOPE'", "it has r"],

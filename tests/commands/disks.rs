@@ -73,7 +73,7 @@ impl<'a> Apart<'a> {
     /// The arguments that send room `a` of the store `source` to it.
     fn push(&self) -> String {
         format!(
-            "push rooms/a --store source --server {}",
+            "push rooms/a --replace --store source --server {}",
             self.server.address
         )
     }

@@ -91,7 +91,7 @@ fn a_server_that_is_killed_during_an_upload_leaves_an_old_or_a_new_revision() {
     }
 
     // How long an upload takes that nobody kills.
-    let push = "push rooms/a --store source --server";
+    let push = "push rooms/a --replace --store source --server";
     let mut server = here.serve("--writable");
     let began = Instant::now();
     here.succeeds(&format!("{push} {}", server.address));

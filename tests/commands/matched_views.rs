@@ -39,7 +39,7 @@ fn mapped() -> Place {
     let model = shared().join("models/xfeat_keypoints_320x240.onnx");
     fs::copy(model, here.file("model.onnx")).unwrap();
     here.succeeds(
-        "encode --store store --room kitchen --model model.onnx --recipe xfeat-keypoints",
+        "encode --store store --room kitchen --encoder model.onnx --recipe xfeat-keypoints",
     );
     here
 }
@@ -77,7 +77,7 @@ fn pose_of(answer: &Value) -> Pose {
 fn a_view_is_located_by_its_keypoints_without_an_adapter() {
     let here = mapped();
     here.succeeds(
-        "studio --rooms 1 --frames 12 --seed 3 --out drawn --encode builtin --keep-images",
+        "studio --rooms 1 --frames 12 --seed 3 --store drawn --encoder builtin --keep-images",
     );
     let other = walk(&here.file("drawn"));
     let other = other
@@ -88,12 +88,12 @@ fn a_view_is_located_by_its_keypoints_without_an_adapter() {
     // A room whose keypoints are lost, and an adapter whose encoder the server does not have.
     here.succeeds("import 7scenes kitchen --name damaged --camera 640x480,525 --store store");
     here.succeeds(
-        "encode --store store --room damaged --model model.onnx --recipe xfeat-keypoints",
+        "encode --store store --room damaged --encoder model.onnx --recipe xfeat-keypoints",
     );
     let objects = walk(&here.file("store/rooms/damaged"));
     let lost = objects.iter().find(|file| file.contains("keypoints"));
     fs::remove_file(lost.expect("no file of keypoints")).unwrap();
-    here.succeeds("encode --store store --room kitchen --model builtin");
+    here.succeeds("encode --store store --room kitchen --encoder builtin");
     here.succeeds(
         "train --store store --room kitchen --features builtin --split whole --stride 4 --epochs 1 --name blind",
     );
@@ -224,7 +224,9 @@ fn tracks_without_an_adapter(here: &Place, to: &str) {
     // An image tells more than a feature, and the filter needs one.
     here.succeeds("export numpy --store store --room kitchen --out exported");
     here.refuses(
-        &format!("track {to} --room kitchen --feature exported/features_builtin.npy --count 2"),
+        &format!(
+            "track {to} --room kitchen --feature-file exported/features_builtin.npy --count 2"
+        ),
         &["frame.view: must be an image"],
     );
 }
@@ -244,7 +246,7 @@ fn evaluates_odometry_without_an_adapter(here: &Place) {
     assert!(number(&found["coverage"]["95"]) > 0.5, "{found}");
     assert_eq!(number(&found["tracking_wrong"]), 0.0);
 
-    here.succeeds("studio --rooms 1 --frames 20 --seed 3 --out plain --encode builtin");
+    here.succeeds("studio --rooms 1 --frames 20 --seed 3 --store plain --encoder builtin");
     here.refuses(
         "evaluate odometry --store plain --room studio3-0000 --hold-out interleaved",
         &["has no keypoints", "--adapter"],

@@ -41,13 +41,13 @@ fn recordings_are_imported_once_and_given_back() {
     let tum = "import tum golden/datasets/tum --store store";
     here.refuses(&format!("{tum} --name chess"), &["--replace"]);
 
-    here.succeeds("encode --store store --room tiny --model pixels");
+    here.succeeds("encode --store store --room tiny --encoder pixels");
 
     // An encoded room is the same room.
     let tiny = "import scannet golden/datasets/scannet_sens/tiny.sens --store store";
     here.prints(tiny, &["already there, unchanged: revision 2"]);
 
-    let thinned = format!("{tum} --name thin --every 4 --licence CC-BY");
+    let thinned = format!("{tum} --name thin --every 4 --license CC-BY");
     here.prints(
         &thinned,
         &["room 'thin': 2 frames with timestamps, every 4 of 6"],
@@ -110,12 +110,12 @@ fn features(here: &Place, store: &str, room: &str, name: &str) -> Array2<f32> {
 
 /// Draws a room with its images.
 fn draw(here: &Place, frames: usize) {
-    let studio = "studio --out store --rooms 1 --seed 4 --keep-images";
+    let studio = "studio --store store --rooms 1 --seed 4 --keep-images";
     here.succeeds(&format!("{studio} --frames {frames}"));
 }
 
 /// Encodes the room that was drawn.
-const ENCODE: &str = "encode --store store --room studio4-0000 --model pixels";
+const ENCODE: &str = "encode --store store --room studio4-0000 --encoder pixels";
 
 /// Oracle: PNG is lossless, so encoding the kept images gives the features that were encoded as
 /// they were drawn; and a second run finds all of it there.
@@ -123,22 +123,22 @@ const ENCODE: &str = "encode --store store --room studio4-0000 --model pixels";
 fn a_suite_is_drawn_once_and_encodes_as_its_images_do() {
     let here = Place::new();
 
-    let studio = "studio --out store --rooms 2 --frames 24 --seed 3 --keep-images";
+    let studio = "studio --store store --rooms 2 --frames 24 --seed 3 --keep-images";
     here.prints(studio, &["2 rooms drawn, 0 were there already"]);
     here.prints(studio, &["0 rooms drawn, 2 were there already"]);
 
     let streamed = features(&here, "store", "studio3-0001", "builtin");
     assert_eq!(streamed.dim(), (24, 528));
 
-    let encode = "encode --store store --room studio3-0001 --model builtin --as kept";
+    let encode = "encode --store store --room studio3-0001 --encoder builtin --as kept";
     here.prints(encode, &["encoded 24 frames"]);
     assert_eq!(features(&here, "store", "studio3-0001", "kept"), streamed);
     here.prints(encode, &["already there"]);
 
-    let pixels = "studio --out store --rooms 2 --frames 24 --seed 3 --encode pixels";
+    let pixels = "studio --store store --rooms 2 --frames 24 --seed 3 --encoder pixels";
     here.refuses(pixels, &["was kept at 64×48", "another store"]);
 
-    here.succeeds("studio --out other --rooms 2 --frames 24 --seed 3 --threads 1");
+    here.succeeds("studio --store other --rooms 2 --frames 24 --seed 3 --threads 1");
 
     assert_eq!(
         features(&here, "other", "studio3-0001", "builtin"),
@@ -147,7 +147,7 @@ fn a_suite_is_drawn_once_and_encodes_as_its_images_do() {
     );
 
     here.refuses(
-        "studio --out store --rooms 1 --frames 25 --seed 3",
+        "studio --store store --rooms 1 --frames 25 --seed 3",
         &["other frames"],
     );
 
@@ -275,7 +275,7 @@ fn models_need_a_build_that_can_run_them() {
 
     here.refuses("encoders nothing", &["dinov2-b"]);
     let room = "encode --store . --room r";
-    let encode = format!("{room} --model golden/encoder/image.onnx");
+    let encode = format!("{room} --encoder golden/encoder/image.onnx");
 
     if cfg!(feature = "onnx") {
         here.refuses(&encode, &["--recipe NAME"]);
@@ -285,7 +285,7 @@ fn models_need_a_build_that_can_run_them() {
             &["resnet", "dinov2-b"],
         );
 
-        here.refuses(&format!("{room} --model nowhere.onnx"), &["nowhere.onnx"]);
+        here.refuses(&format!("{room} --encoder nowhere.onnx"), &["nowhere.onnx"]);
 
         here.refuses(&format!("{encode} --divisor 255 --pool max"), &["max"]);
     } else {
@@ -367,13 +367,16 @@ fn inverted_poses_are_named_at_import_and_by_check() {
     assert!(is_clean(&import("right", "--strict")));
     assert!(check("right").status.success());
 
-    let refused = here.run("import folder wrong --store store --strict");
-    assert_eq!(refused.status.code(), Some(1));
-    let refused = said(&refused);
-    assert!(refused.contains("nothing was published"), "{refused}");
+    let refused = || {
+        let output = here.run("import folder wrong --store store");
+        assert_eq!(output.status.code(), Some(1));
+        said(&output)
+    };
+    let remedy = "nothing was published. Remedy: import again with: --poses camera_from_world";
+    assert!(refused().contains(remedy), "{}", refused());
     assert!(!here.file("store/rooms/wrong").exists());
 
-    let warned = import("wrong", "");
+    let warned = import("wrong", "--allow-contradicted");
     assert!(warned.contains("contradict the poses"), "{warned}");
     assert!(warned.contains("--poses camera_from_world"), "{warned}");
 
@@ -382,6 +385,13 @@ fn inverted_poses_are_named_at_import_and_by_check() {
     let said: serde_json::Value = serde_json::from_slice(&checked.stdout).unwrap();
     assert_eq!(said["images"]["verdict"], "other_convention");
     assert_eq!(said["images"]["sizes"][0]["count"], 60);
+
+    // The room is there now: its correction replaces it.
+    let again = refused();
+    assert!(
+        again.contains(remedy) && again.contains("add --replace"),
+        "{again}"
+    );
 
     // Read as the warning says, all is well.
     let read_right = import("wrong", "--poses camera_from_world");

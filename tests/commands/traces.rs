@@ -79,6 +79,7 @@ async fn requests_are_spans_of_their_callers_traces() {
     let mut client = CatalogServiceClient::new(channel.connect().await.unwrap());
     let mut ask = async |room: &str, parent: [u8; 8]| {
         let mut request = Request::new(pb::GetRoomRequest {
+            room_revision: None,
             room: room.to_owned(),
         });
         let parent = parent.map(|byte| format!("{byte:02x}")).concat();

@@ -121,7 +121,9 @@ def checked(
     for number, image in enumerate(images):
         prepare(image, folder / "images" / f"{number:06}{image.suffix}")
     np.save(folder / "poses.npy", poses)
-    said = seese3.run("import", "folder", folder, "--room", "x", "--store", folder / "store", "--json", "-")
+    said = seese3.run(
+        "import", "folder", folder, "--room", "x", "--store", folder / "store", "--allow-contradicted", "--json", "-"
+    )
     report: dict[str, Any] = json.loads(said)
     return report
 

@@ -18,15 +18,7 @@ from typing import TypeAlias
 import grpc
 import numpy as np
 import seese3
-from seese3.v1 import (
-    geometry_pb2,
-    localization_pb2,
-    localization_pb2_grpc,
-    navigation_pb2,
-    navigation_pb2_grpc,
-    odometry_pb2,
-    odometry_pb2_grpc,
-)
+from seese3.v1 import geometry_pb2, localization_pb2, navigation_pb2, odometry_pb2, stub
 
 COLUMNS, FRAMES, BATCH = 768, 1000, 100
 ROOM, CALIBRATION_ROOMS = "room", ("other-0", "other-1")
@@ -72,14 +64,14 @@ def rate(call: Callable[[int], object], seconds: float) -> float:
 
 def streams(client: seese3.Client, channel: grpc.Channel, rows: np.ndarray) -> Cases:
     """Tracking, frame by frame as a camera is followed, and a recording, whose frames are all there."""
-    odometry = odometry_pb2_grpc.OdometryServiceStub(channel)  # type: ignore[no-untyped-call]
+    odometry = stub("OdometryService", channel)
     config = seese3.TrackConfig(room=ROOM)
 
     def messages() -> Iterator[odometry_pb2.TrackRequest]:
         yield odometry_pb2.TrackRequest(config=odometry_pb2.TrackConfig(room=ROOM, token_every=1))
         for row in range(STREAMED):
             view = geometry_pb2.View(feature=geometry_pb2.Feature(values=rows[row]))
-            frame = odometry_pb2.TrackFrame(sequence=row + 1, timestamp_ns=row * PERIOD_NS, view=view)
+            frame = odometry_pb2.TrackFrame(sequence_number=row + 1, timestamp_ns=row * PERIOD_NS, view=view)
             yield odometry_pb2.TrackRequest(frame=frame)
 
     def by_steps(_: int) -> None:
@@ -115,8 +107,8 @@ def streams(client: seese3.Client, channel: grpc.Channel, rows: np.ndarray) -> C
 def cases(client: seese3.Client, address: str, rows: np.ndarray) -> Cases:
     """By name: the package's way, and that of the stubs, with protobuf's lists as their documentation has it."""
     channel = grpc.insecure_channel(address)
-    navigation = navigation_pb2_grpc.NavigationServiceStub(channel)  # type: ignore[no-untyped-call]
-    localization = localization_pb2_grpc.LocalizationServiceStub(channel)  # type: ignore[no-untyped-call]
+    navigation = stub("NavigationService", channel)
+    localization = stub("LocalizationService", channel)
 
     def view(row: int) -> geometry_pb2.View:
         return geometry_pb2.View(feature=geometry_pb2.Feature(values=rows[row % FRAMES]))
@@ -147,7 +139,7 @@ def cases(client: seese3.Client, address: str, rows: np.ndarray) -> Cases:
             lambda n: [
                 (answer.frame.id, answer.frame.pose)
                 for answer in client.navigate_batch(
-                    ROOM, [seese3.Question(one % FRAMES, twist=MOTION, steps=4) for one in range(n, n + BATCH)]
+                    ROOM, [seese3.NavigationQuery(one % FRAMES, twist=MOTION, steps=4) for one in range(n, n + BATCH)]
                 )
             ],
             lambda n: [

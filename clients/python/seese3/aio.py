@@ -4,42 +4,40 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncIterable, AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterable, AsyncIterator, Callable, Mapping, Sequence
 from types import TracebackType
-from typing import Any
+from typing import Any, Literal
 
 import grpc
-import numpy as np
 import numpy.typing as npt
 
 from . import answers, channel, errors, requests
-from .answers import Adapter, Camera, Default, Evaluation, Publication, Room, TrackRefusal, TrackStart, TrackUpdate
+from .answers import (
+    Adapter,
+    Camera,
+    CatalogDefault,
+    Evaluation,
+    Publication,
+    Room,
+    TrackRefusal,
+    TrackStart,
+    TrackUpdate,
+)
 from .geometry import wire_pose
 from .requests import (
     DepthImage,
     Gravity,
     InertialSamples,
     InitialPose,
+    NavigationQuery,
     Odometry,
     Prediction,
-    Question,
     TrackConfig,
     Upload,
 )
-from .v1 import (
-    catalog_pb2,
-    catalog_pb2_grpc,
-    evaluation_pb2,
-    evaluation_pb2_grpc,
-    geometry_pb2,
-    localization_pb2,
-    localization_pb2_grpc,
-    navigation_pb2,
-    navigation_pb2_grpc,
-    odometry_pb2,
-    odometry_pb2_grpc,
-)
+from .v1 import catalog_pb2, evaluation_pb2, localization_pb2, navigation_pb2, odometry_pb2, stub
 from .views import View, wire_view
+from .words import InverseVariant, Planner, Split, StepMode, UploadMode, enum_value
 
 # How often and how soon a cut tracking stream is opened again.
 RESUMPTIONS = 5
@@ -59,8 +57,7 @@ class AsyncClient:
     - `deadline_s`: how long a call may take, seconds; None is for ever. Every method takes another one as `deadline_s`.
     - `retries`: how often a read is made again when the server does not answer or is busy, 0 to 4.
 
-    Every method raises a `RefusedError` if the server refuses, see `errors`. Adapters are named by `adapter`; "" is the
-    default of the room. Thresholds ε of Hit@ε mix metres and radians; () are the server's.
+    Every method raises a `RefusedError` if the server refuses, see `errors`.
     """
 
     def __init__(
@@ -77,11 +74,11 @@ class AsyncClient:
         self._deadline_s = deadline_s
         self._metadata = channel.metadata(token)
         self._channel = channel.open_async(address, tls, retries)
-        self._catalog = _stub(catalog_pb2_grpc.CatalogServiceStub, self._channel)
-        self._navigation = _stub(navigation_pb2_grpc.NavigationServiceStub, self._channel)
-        self._localization = _stub(localization_pb2_grpc.LocalizationServiceStub, self._channel)
-        self._odometry = _stub(odometry_pb2_grpc.OdometryServiceStub, self._channel)
-        self._evaluation = _stub(evaluation_pb2_grpc.EvaluationServiceStub, self._channel)
+        self._catalog = stub("CatalogService", self._channel)
+        self._navigation = stub("NavigationService", self._channel)
+        self._localization = stub("LocalizationService", self._channel)
+        self._odometry = stub("OdometryService", self._channel)
+        self._evaluation = stub("EvaluationService", self._channel)
 
     async def __aenter__(self) -> AsyncClient:
         return self
@@ -132,111 +129,181 @@ class AsyncClient:
         to: int | None = None,
         twist: npt.ArrayLike | None = None,
         pose: npt.ArrayLike | None = None,
-        adapter: str = "",
+        room_revision: int | None = None,
+        adapter: str | None = None,
+        adapter_revision: int | None = None,
         source_pose: npt.ArrayLike | None = None,
         steps: int | None = None,
-        mode: str | None = None,
-        reading: str | None = None,
-        navigator: str = "",
+        step_mode: StepMode | None = None,
+        inverse_variant: InverseVariant | None = None,
+        navigator: str | None = None,
         top_k: int | None = None,
         exclude_source: bool = False,
         exclude_radius: int = 0,
-        thresholds: Sequence[float] = (),
         deadline_s: float | None = None,
     ) -> answers.Navigation:
-        """Imagines a motion from `source`, and retrieves the stored frame that shows the view after it.
+        """Imagines a motion from a view, and retrieves the stored frame that shows the view after it.
 
-        The motion leads `to` a frame, or is a `twist` (6,) or several (n, 6), or leads to a `pose` (4, 4) in the world.
-        `mode` is "open_loop", "snap" or "closed_loop"; `reading` "affine", "homogeneous" or "literal".
+        Args:
+            room: The room to navigate in.
+            source: The view that the motion starts from.
+            to: The frame at the end of the motion. Exactly one of `to`, `twist` and `pose` is required.
+            twist: The motion (6,), or several motions (n, 6), in the body frame of the source camera.
+            pose: The camera pose at the end of the motion, world_from_camera (4, 4).
+            room_revision: The revision of the room; None for the current one.
+            adapter: The adapter; None for the room's default.
+            adapter_revision: The revision of `adapter`; None for the current one.
+            source_pose: The camera pose of the source (4, 4), if it is known and the source is no stored frame.
+            steps: The number of equal steps that each motion is divided into; None for 1.
+            step_mode: How steps are chained: "open_loop" (the default), "snap" or "closed_loop".
+            inverse_variant: "homogeneous" (the default), "affine" or "literal".
+            navigator: A navigator by name, one of `Adapter.navigators`; None for inverse Poincaré.
+            top_k: The number of frames to retrieve for each step; None for 1.
+            exclude_source: Whether the frame that a step starts from may not be retrieved.
+            exclude_radius: The number of rows before and after that frame that may not be retrieved either.
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            The retrieved frames of each step.
+
+        Raises:
+            RefusedError: The server refused the request; `field` names what to change.
+            ValueError: An argument is not valid.
+
+        Example:
+            >>> client.navigate("kitchen", 100, to=140, steps=4).frame.id
         """
-        question = Question(
+        query = NavigationQuery(
             source=source,
             to=to,
             twist=twist,
             pose=pose,
             source_pose=source_pose,
             steps=steps,
-            mode=mode,
-            reading=reading,
+            step_mode=step_mode,
+            inverse_variant=inverse_variant,
             navigator=navigator,
             top_k=top_k,
             exclude_source=exclude_source,
             exclude_radius=exclude_radius,
-            thresholds=thresholds,
         )
-        answer = await self._ask(self._navigation.Navigate, question.request(room, adapter), deadline_s)
-        return answers.Navigation.of(answer)
+        request = query.request(room, adapter, room_revision, adapter_revision)
+        return answers.Navigation.of(await self._ask(self._navigation.Navigate, request, deadline_s))
 
     async def navigate_batch(
-        self, room: str, questions: Sequence[Question], *, adapter: str = "", deadline_s: float | None = None
+        self,
+        room: str,
+        queries: Sequence[NavigationQuery],
+        *,
+        room_revision: int | None = None,
+        adapter: str | None = None,
+        adapter_revision: int | None = None,
+        deadline_s: float | None = None,
     ) -> list[answers.Navigation | errors.RefusedError]:
-        """Answers many questions in one call.
+        """Answers many navigation queries in one call.
 
-        A question that the server refuses has its exception in its place, also where the room is not there. A question
-        that cannot be asked at all is a `ValueError` that names it.
+        Args:
+            room: The room to navigate in.
+            queries: The queries; the server's limit is `server_info().limits["batch"]`.
+            room_revision: The revision of the room; None for the current one.
+            adapter: The adapter; None for the room's default.
+            adapter_revision: The revision of `adapter`; None for the current one.
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            One entry for each query, in order. A query that the server refuses has its exception in its place.
+
+        Raises:
+            RefusedError: The server refused the whole batch.
+            ValueError: A query is not valid; the message names it.
+
+        Example:
+            >>> client.navigate_batch("kitchen", [NavigationQuery(frame, to=frame + 20) for frame in range(100)])
         """
         batch = []
-        for number, question in enumerate(questions):
+        for number, query in enumerate(queries):
             try:
-                batch.append(question.request(room, adapter))
+                batch.append(query.request(room, adapter, room_revision, adapter_revision))
             except (TypeError, ValueError) as error:
-                raise type(error)(f"questions[{number}]: {error}") from None
+                raise type(error)(f"queries[{number}]: {error}") from None
         request = navigation_pb2.BatchNavigateRequest(requests=batch)
         return answers.batch_of(await self._ask(self._navigation.BatchNavigate, request, deadline_s))
 
-    async def navigate_to(
+    async def plan_route(
         self,
         room: str,
         source: View,
         *,
         goal: int | None = None,
         goal_pose: npt.ArrayLike | None = None,
-        adapter: str = "",
+        room_revision: int | None = None,
+        adapter: str | None = None,
+        adapter_revision: int | None = None,
         source_pose: npt.ArrayLike | None = None,
-        step: float | None = None,
+        camera: Camera | Literal["mapping"] | None = None,
+        max_hop_length: float | None = None,
         tolerance_m: float | None = None,
         tolerance_rad: float | None = None,
-        max_steps: int | None = None,
+        max_hops: int | None = None,
         max_recoveries: int | None = None,
-        planner: str | None = None,
-        least_arrival_probability: float | None = None,
-        camera: Camera | str | None = None,
-        on_step: Callable[[answers.WayStep], None] | None = None,
+        planner: Planner | None = None,
+        min_arrival_probability: float | None = None,
         deadline_s: float | None = None,
-    ) -> answers.Way:
-        """Plans a way from `source` to a stored frame or a pose (4, 4). `planner` is "pose_graph" or "latent".
+    ) -> answers.Route:
+        """Plans a route over stored frames to a goal. Nothing is driven, and obstacles are unknown.
 
-        `on_step` is called with every step as it arrives; the way that is returned has them all. `camera` is that of
-        an image, or "mapping"; with it, the start is estimated from matched keypoints if the room has any.
+        Args:
+            room: The room.
+            source: The view that the route starts from.
+            goal: The frame whose pose is the goal. Exactly one of `goal` and `goal_pose` is required.
+            goal_pose: The goal as a camera pose, world_from_camera (4, 4).
+            room_revision: The revision of the room; None for the current one.
+            adapter: The adapter; None for the room's default.
+            adapter_revision: The revision of `adapter`; None for the current one.
+            source_pose: The camera pose of the source (4, 4); None to estimate it, as `localize` does.
+            camera: The camera of a source that is an image, or "mapping" for the one that mapped the room. With it,
+                the start is estimated from matched keypoints if the room has any.
+            max_hop_length: The maximum norm of a hop's motion, meters and radians mixed; None to let the server choose.
+            tolerance_m: The distance tolerance of the goal, meters; None for 0.25.
+            tolerance_rad: The angle tolerance of the goal, radians; None for 15 degrees.
+            max_hops: The maximum number of hops; None for 100.
+            max_recoveries: The maximum number of recoveries of the planner "latent"; None for 10.
+            planner: "pose_graph" (the default) or "latent", the paper's.
+            min_arrival_probability: The minimum arrival probability of a route, 0 to 1; None for 0.2.
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            The route. Check its `outcome`: only "found" has hops.
+
+        Raises:
+            RefusedError: The server refused the request; `field` names what to change.
+            ValueError: An argument is not valid.
+
+        Example:
+            >>> route = client.plan_route("kitchen", 10, goal=400)
+            >>> [hop.motion for hop in route.hops]
         """
         if (goal is None) == (goal_pose is None):
             raise ValueError("give exactly one of goal (a frame's row) and goal_pose")
-        request = navigation_pb2.NavigateToRequest(
+        request = navigation_pb2.PlanRouteRequest(
             room=room,
+            room_revision=room_revision,
             adapter=adapter,
+            adapter_revision=adapter_revision,
             source=wire_view(source),
             source_pose=None if source_pose is None else wire_pose(source_pose),
+            source_camera=requests.wire_view_camera(camera),
             goal_frame_id=requests.count(goal, "goal"),
             goal_pose=None if goal_pose is None else wire_pose(goal_pose),
-            step=step,
+            max_hop_length=max_hop_length,
             tolerance_m=tolerance_m,
             tolerance_rad=tolerance_rad,
-            max_steps=requests.count(max_steps, "max_steps"),
+            max_hops=requests.count(max_hops, "max_hops"),
             max_recoveries=requests.count(max_recoveries, "max_recoveries"),
-            planner=requests.enum_value(navigation_pb2.Planner, "PLANNER_", planner, "planner"),  # type: ignore[arg-type]
-            least_arrival_probability=least_arrival_probability,
-            source_camera=requests.wire_view_camera(camera),
+            planner=enum_value(navigation_pb2.Planner, "PLANNER_", planner, "planner"),
+            min_arrival_probability=min_arrival_probability,
         )
-        call = self._navigation.NavigateTo(request, timeout=self._timeout(deadline_s), metadata=self._metadata)
-
-        steps: list[answers.WayStep] = []
-        async for message in self._listen(call):
-            if message.HasField("result"):
-                return answers.Way.of(steps, message.result)
-            steps.append(answers.WayStep.of(message.feedback))
-            if on_step is not None:
-                on_step(steps[-1])
-        raise errors.SeeseError("the server ended a navigation without a result")
+        return answers.Route.of(await self._ask(self._navigation.PlanRoute, request, deadline_s))
 
     # Localization.
 
@@ -245,23 +312,46 @@ class AsyncClient:
         view: View,
         *,
         rooms: Sequence[str] | str = (),
-        adapter: str = "",
+        room_revisions: Mapping[str, int] | None = None,
+        adapter: str | None = None,
+        adapter_revision: int | None = None,
         top_k: int | None = None,
-        thresholds: Sequence[float] = (),
-        camera: Camera | str | None = None,
+        camera: Camera | Literal["mapping"] | None = None,
         deadline_s: float | None = None,
     ) -> answers.Localization:
-        """Estimates the pose of a view in one room, in several, or in all: ().
+        """Estimates the pose of the camera that took a view.
 
-        `camera` is that of an image, or "mapping" for the camera that mapped the room. It is required if the room has
-        keypoints.
+        Args:
+            view: A feature, a latent or an image; a stored frame only if one room is named.
+            rooms: The room or rooms to search; () for all.
+            room_revisions: The revisions of rooms that are not the current ones.
+            adapter: The adapter. None for the default of a single room, or the only one that serves all rooms; a room
+                with keypoints needs none for an image.
+            adapter_revision: The revision of `adapter`; None for the current one.
+            top_k: The number of similar frames to return; None for 1.
+            camera: The camera of an image, or "mapping" for the one that mapped the room. Required if the view is an
+                image and a room has keypoints.
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            The pose with its covariance, how it was obtained, and similar frames. `pose` is None if the view is not
+            in the map.
+
+        Raises:
+            RefusedError: The server refused the request; `field` names what to change.
+            ValueError: An argument is not valid.
+
+        Example:
+            >>> found = client.localize("photo.jpg", rooms="kitchen")
+            >>> found.pose, found.covariance, found.novelty
         """
         request = localization_pb2.LocalizeRequest(
             rooms=requests.names(rooms),
+            room_revisions=room_revisions,
             adapter=adapter,
+            adapter_revision=adapter_revision,
             view=wire_view(view),
             top_k=requests.count(top_k, "top_k"),
-            thresholds=thresholds,
             camera=requests.wire_view_camera(camera),
         )
         return answers.Localization.of(await self._ask(self._localization.Localize, request, deadline_s))
@@ -271,20 +361,45 @@ class AsyncClient:
         views: Sequence[View],
         *,
         rooms: Sequence[str] | str = (),
-        adapter: str = "",
+        room_revisions: Mapping[str, int] | None = None,
+        adapter: str | None = None,
+        adapter_revision: int | None = None,
         max_rooms: int | None = None,
         top_k: int | None = None,
-        camera: Camera | str | None = None,
+        camera: Camera | Literal["mapping"] | None = None,
         deadline_s: float | None = None,
     ) -> answers.Relocalization:
-        """Finds the room of a camera and its pose there, from some views, the newest last.
+        """Finds the room of a camera and its pose there.
 
-        `camera` is that of the images, or "mapping" for the camera that mapped the room. It is required if a room has
-        keypoints.
+        Args:
+            views: Views of one camera that hardly moves between them, the newest last; no stored frames.
+            rooms: The room or rooms to search; () for all.
+            room_revisions: The revisions of rooms that are not the current ones.
+            adapter: The adapter; None for the only calibrated one that serves the rooms. Images of rooms with
+                keypoints need none.
+            adapter_revision: The revision of `adapter`; None for the current one.
+            max_rooms: The maximum number of rooms to return; None for 3.
+            top_k: The number of frames to return for each room; None for 1.
+            camera: The camera of the images, or "mapping" for the one that mapped the room. Required if the views are
+                images and a room has keypoints.
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            The rooms, the best match first, and whether the best one is ambiguous.
+
+        Raises:
+            RefusedError: The server refused the request; `field` names what to change.
+            TypeError: `views` is one view, and no sequence of views.
+
+        Example:
+            >>> found = client.relocalize(["a.jpg", "b.jpg"], camera="mapping")
+            >>> found.rooms[0].room.name, found.ambiguous
         """
         request = localization_pb2.RelocalizeRequest(
             rooms=requests.names(rooms),
+            room_revisions=room_revisions,
             adapter=adapter,
+            adapter_revision=adapter_revision,
             views=requests.wire_views(views),
             max_rooms=requests.count(max_rooms, "max_rooms"),
             top_k=requests.count(top_k, "top_k"),
@@ -299,20 +414,43 @@ class AsyncClient:
         first: View,
         second: View,
         *,
-        room: str = "",
-        adapter: str = "",
+        room: str | None = None,
+        room_revision: int | None = None,
+        adapter: str | None = None,
+        adapter_revision: int | None = None,
         camera: Camera | None = None,
-        thresholds: Sequence[float] = (),
         deadline_s: float | None = None,
     ) -> answers.Motion:
-        """Estimates the motion (6,) from one view to another, in the body frame of the first camera."""
+        """Estimates the motion from one view to another.
+
+        Args:
+            first: The view at the start of the motion.
+            second: The view at the end of the motion.
+            room: The room that stored frames belong to; its default adapter is used.
+            room_revision: The revision of the room; None for the current one.
+            adapter: The adapter; None for the default of the room, or the only adapter that is not fitted to a room.
+                Two images of a known camera need none.
+            adapter_revision: The revision of `adapter`; None for the current one.
+            camera: The camera of both images; None for that of the room, if it is known.
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            The motion (6,), in the body frame of the first camera.
+
+        Raises:
+            RefusedError: The server refused the request; `field` names what to change.
+
+        Example:
+            >>> client.motion("a.jpg", "b.jpg", camera=Camera(640, 480, fx=585)).twist
+        """
         request = odometry_pb2.EstimateMotionRequest(
             room=room,
+            room_revision=room_revision,
             adapter=adapter,
+            adapter_revision=adapter_revision,
             first=wire_view(first),
             second=wire_view(second),
             camera=requests.wire_camera(camera),
-            thresholds=thresholds,
         )
         return answers.Motion.of(await self._ask(self._odometry.EstimateMotion, request, deadline_s))
 
@@ -320,15 +458,40 @@ class AsyncClient:
         self,
         views: Sequence[View],
         *,
-        room: str = "",
-        adapter: str = "",
+        room: str | None = None,
+        room_revision: int | None = None,
+        adapter: str | None = None,
+        adapter_revision: int | None = None,
         with_features: bool = False,
         deadline_s: float | None = None,
     ) -> answers.Encoding:
-        """Turns views into latents of an adapter, which can be sent wherever a view is asked for."""
+        """Converts views to latents of an adapter, which can be sent wherever a view is taken.
+
+        Args:
+            views: The views, 1 to 256.
+            room: The room that stored frames belong to; its default adapter is used.
+            room_revision: The revision of the room; None for the current one.
+            adapter: The adapter; None for the default of the room, or the only adapter that is not fitted to a room.
+            adapter_revision: The revision of `adapter`; None for the current one.
+            with_features: Whether to return raw features too.
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            The latents (n, k), with the adapter that made them.
+
+        Raises:
+            RefusedError: The server refused the request; `field` names what to change.
+            TypeError: `views` is one view, and no sequence of views.
+
+        Example:
+            >>> encoding = client.encode(["photo.jpg"], room="kitchen")
+            >>> client.localize(encoding.latent(0), rooms="kitchen")
+        """
         request = odometry_pb2.EncodeRequest(
             room=room,
+            room_revision=room_revision,
             adapter=adapter,
+            adapter_revision=adapter_revision,
             views=requests.wire_views(views),
             with_features=with_features,
         )
@@ -339,21 +502,36 @@ class AsyncClient:
         config: TrackConfig | None = None,
         *,
         resume_token: bytes = b"",
-        last_sequence: int | None = None,
+        last_sequence_number: int | None = None,
         deadline_s: float | None = None,
     ) -> AsyncTrack:
         """Opens a stream that follows a camera: `async with client.track(TrackConfig(room="kitchen")) as track`.
 
-        To go on with a stream of another program, give its `resume_token` and its `last_sequence`. The deadline is
-        that of opening the stream, the first time and when it was cut; `step` has its own.
+        Args:
+            config: What the stream is to do.
+            resume_token: The token of a stream of another program that goes on here, instead of `config`.
+            last_sequence_number: The number of the last frame of that stream.
+            deadline_s: Time limit of opening the stream, also again after it was cut; `step` has its own.
+
+        Returns:
+            The stream, to be used in `with`.
+
+        Raises:
+            ValueError: Not exactly one of `config` and `resume_token` is given.
+
+        Example:
+            >>> with client.track(TrackConfig(room="kitchen")) as track:
+            ...     update = track.step("frame.jpg", timestamp_ns=0)
         """
         self._check_open()
         if (config is None) == (not resume_token):
             raise ValueError("give exactly one of config and resume_token")
-        if bool(resume_token) != (last_sequence is not None):
-            raise ValueError("resume_token and last_sequence belong together: frames go on with the number after it")
+        if bool(resume_token) != (last_sequence_number is not None):
+            raise ValueError("resume_token and last_sequence_number belong together")
         message = config.message() if config else odometry_pb2.TrackConfig(resume_token=resume_token)
-        return AsyncTrack(self._odometry.Track, self._metadata, message, last_sequence or 0, self._timeout(deadline_s))
+        return AsyncTrack(
+            self._odometry.Track, self._metadata, message, last_sequence_number or 0, self._timeout(deadline_s)
+        )
 
     # Evaluation.
 
@@ -361,35 +539,64 @@ class AsyncClient:
         self,
         room: str,
         *,
-        adapter: str = "",
+        room_revision: int | None = None,
+        adapter: str | None = None,
+        adapter_revision: int | None = None,
         stride: int | None = None,
-        split: str = "",
+        split: Split | None = None,
         navigators: Sequence[str] | str = (),
         exclude_source: bool = False,
         exclude_radius: int = 0,
         thresholds: Sequence[float] = (),
         seed: int = 0,
         steps: int | None = None,
-        mode: str | None = None,
+        step_mode: StepMode | None = None,
         on_progress: Callable[[int, int], None] | None = None,
         deadline_s: float | None = None,
     ) -> Evaluation:
-        """Scores navigators on a room's held-out pairs, beside the identity and a random frame.
+        """Scores navigators on a room's test pairs, beside the identity and a random frame.
 
-        `on_progress` is called with how many of how many navigators are done. The deadline is none unless it is given.
+        Args:
+            room: The room.
+            room_revision: The revision of the room; None for the current one.
+            adapter: The adapter. None for one from which the test pairs were held out: the room's default, else the
+                newest that was trained in the room. An adapter that is fitted to the room must be named, and leaks.
+            adapter_revision: The revision of `adapter`; None for the current one.
+            stride: The number of frames from source to target; None for that of the adapter's training.
+            split: The split that defines the test pairs; None for that of the adapter's training.
+            navigators: The navigators by name; () for the baselines and all navigators of the adapter.
+            exclude_source: Whether the source frame of a pair may not be retrieved.
+            exclude_radius: The number of rows before and after it that may not be retrieved either.
+            thresholds: The thresholds ε of Hit@ε, meters and radians mixed; () for 0.1, 0.2, 0.3 and 0.5.
+            seed: The seed of the navigator "random".
+            steps: The number of equal steps that each motion is divided into; None for 1.
+            step_mode: How steps are chained: "open_loop" (the default), "snap" or "closed_loop".
+            on_progress: Called with the number of navigators that are done, and of all.
+            deadline_s: Time limit of the call, seconds; None for no limit.
+
+        Returns:
+            The scores, with 95 % intervals.
+
+        Raises:
+            RefusedError: The server refused the request; `field` names what to change.
+
+        Example:
+            >>> print(client.evaluate("kitchen", exclude_source=True).table())
         """
         request = evaluation_pb2.EvaluateRequest(
             room=room,
+            room_revision=room_revision,
             adapter=adapter,
+            adapter_revision=adapter_revision,
             stride=requests.count(stride, "stride"),
-            split=split,
+            split=requests.split_value(split),
             navigators=requests.names(navigators),
             exclude_source=exclude_source,
             exclude_radius=requests.count(exclude_radius, "exclude_radius"),
             thresholds=thresholds,
             seed=seed,
             steps=requests.count(steps, "steps"),
-            mode=requests.mode(mode),
+            step_mode=requests.step_mode(step_mode),
         )
         self._check_open()
         call = self._evaluation.Evaluate(request, timeout=channel.timeout(deadline_s), metadata=self._metadata)
@@ -403,41 +610,113 @@ class AsyncClient:
                 on_progress(message.progress.done, message.progress.total)
         raise errors.SeeseError("the server ended an evaluation without a report")
 
+    async def split_pairs(
+        self,
+        room: str,
+        split: Split | None = None,
+        stride: int | None = None,
+        *,
+        room_revision: int | None = None,
+        adapter: str | None = None,
+        adapter_revision: int | None = None,
+        deadline_s: float | None = None,
+    ) -> answers.SplitPairs:
+        """The test pairs, the training pairs and the candidate frames of a split, for a navigator of one's own.
+
+        Args:
+            room: The room.
+            split: The split; None for that of `evaluate` with this adapter.
+            stride: The number of frames from source to target; None for that of `evaluate` with this adapter.
+            room_revision: The revision of the room; None for the current one.
+            adapter: The adapter that decides an absent split or stride; None for the default of `evaluate`.
+            adapter_revision: The revision of `adapter`; None for the current one.
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            The pairs and the candidates, as rows of the room.
+
+        Raises:
+            RefusedError: The server refused the request; `field` names what to change.
+
+        Example:
+            >>> pairs = client.split_pairs("kitchen", "blocks", 20)
+            >>> sources, targets = pairs.test.T
+        """
+        request = evaluation_pb2.ListPairsRequest(
+            room=room,
+            room_revision=room_revision,
+            adapter=adapter,
+            adapter_revision=adapter_revision,
+            split=requests.split_value(split),
+            stride=requests.count(stride, "stride"),
+        )
+        return answers.SplitPairs.of(await self._ask(self._evaluation.ListPairs, request, deadline_s))
+
     async def score(
         self,
         room: str,
-        predictions: Sequence[Prediction],
+        predictions: Sequence[Prediction] | None = None,
         *,
-        adapter: str = "",
-        split: str = "",
+        sources: npt.ArrayLike | None = None,
+        targets: npt.ArrayLike | None = None,
+        latents: npt.ArrayLike | None = None,
+        frames: npt.ArrayLike | None = None,
+        name: str = "mine",
+        room_revision: int | None = None,
+        adapter: str | None = None,
+        adapter_revision: int | None = None,
+        split: Split | None = None,
         exclude_source: bool = False,
         exclude_radius: int = 0,
         thresholds: Sequence[float] = (),
         deadline_s: float | None = None,
-    ) -> answers.NavigatorScores:
-        """Scores a navigator of one's own by the same rules as `evaluate`, on the pairs of its predictions."""
+    ) -> Evaluation:
+        """Scores a navigator of one's own by the rules of `evaluate`.
+
+        Args:
+            room: The room.
+            predictions: The predictions, one for each pair; or give them as arrays.
+            sources: The source frames of the pairs, (n,).
+            targets: The target frames of the pairs, (n,).
+            latents: The predicted latents of the targets, (n, k): the server retrieves the nearest candidate of each.
+                Exactly one of `latents` and `frames` is required with `sources` and `targets`.
+            frames: The frames that the navigator retrieved, (n,).
+            name: The name of the navigator in the report.
+            room_revision: The revision of the room; None for the current one.
+            adapter: The adapter of the latents; None for the default of `evaluate`.
+            adapter_revision: The revision of `adapter`; None for the current one.
+            split: Only test pairs of this split are accepted, and only its candidates are retrieved; None for any pair.
+            exclude_source: Whether the source frame of a pair may not be retrieved.
+            exclude_radius: The number of rows before and after it that may not be retrieved either.
+            thresholds: The thresholds ε of Hit@ε, meters and radians mixed; () for 0.1, 0.2, 0.3 and 0.5.
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            A report with one row. `evaluate(…).with_navigator(…)` puts it beside the others.
+
+        Raises:
+            RefusedError: The server refused the request, for instance because a pair is predicted twice.
+            ValueError: The arrays do not fit each other.
+
+        Example:
+            >>> pairs = client.split_pairs("kitchen")
+            >>> sources, targets = pairs.test.T
+            >>> mine = client.score("kitchen", sources=sources, targets=targets, frames=sources, split=pairs.split)
+            >>> print(client.evaluate("kitchen").with_navigator(mine).table())
+        """
         request = evaluation_pb2.ScorePredictionsRequest(
             room=room,
+            room_revision=room_revision,
             adapter=adapter,
-            predictions=[
-                evaluation_pb2.Prediction(
-                    source_frame_id=one.source,
-                    target_frame_id=one.target,
-                    latent=None
-                    if one.latent is None
-                    else geometry_pb2.Latent(values=np.asarray(one.latent, dtype=np.float64).tolist()),
-                    retrieved_frame_id=one.frame,
-                    last_step_frame_id=one.last_step_frame,
-                )
-                for one in predictions
-            ],
-            split=split,
+            adapter_revision=adapter_revision,
+            predictions=requests.predictions(predictions, sources, targets, latents, frames),
+            split=requests.split_value(split),
             exclude_source=exclude_source,
-            exclude_radius=exclude_radius,
+            exclude_radius=requests.count(exclude_radius, "exclude_radius"),
             thresholds=thresholds,
         )
         answer = await self._ask(self._evaluation.ScorePredictions, request, deadline_s)
-        return answers.NavigatorScores.of(answer.scores)
+        return Evaluation.of_scores(answer, request, name)
 
     # The catalog.
 
@@ -460,124 +739,253 @@ class AsyncClient:
             _go_on(request, page.next_page_token)
         raise errors.AnswerError(f"the server's list has more than {MOST_PAGES} pages")
 
-    async def room(self, name: str, *, deadline_s: float | None = None) -> Room:
-        """One room."""
-        request = catalog_pb2.GetRoomRequest(room=name)
-        return Room.of((await self._ask(self._catalog.GetRoom, request, deadline_s)).room)
+    async def server_info(self, *, deadline_s: float | None = None) -> answers.ServerInfo:
+        """The version, the abilities and the limits of the server.
 
-    async def adapter(self, name: str, *, deadline_s: float | None = None) -> Adapter:
-        """One adapter."""
-        request = catalog_pb2.GetAdapterRequest(adapter=name)
-        return Adapter.of((await self._ask(self._catalog.GetAdapter, request, deadline_s)).adapter)
+        Args:
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            What the server offers to this caller.
+
+        Raises:
+            RefusedError: The server refused the request.
+
+        Example:
+            >>> client.server_info().limits["top_k"]
+        """
+        answer = await self._ask(self._catalog.GetServerInfo, catalog_pb2.GetServerInfoRequest(), deadline_s)
+        return answers.ServerInfo.of(answer)
+
+    async def room(self, room: str, *, revision: int | None = None, deadline_s: float | None = None) -> Room:
+        """One room.
+
+        Args:
+            room: The name of the room.
+            revision: The revision; None for the current one.
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            The room.
+
+        Raises:
+            NotFoundError: There is no such room.
+
+        Example:
+            >>> client.room("kitchen").frame_count
+        """
+        request = catalog_pb2.GetRoomRequest(room=room, room_revision=revision)
+        return Room.of(await self._ask(self._catalog.GetRoom, request, deadline_s))
+
+    async def adapter(self, adapter: str, *, revision: int | None = None, deadline_s: float | None = None) -> Adapter:
+        """One adapter.
+
+        Args:
+            adapter: The name of the adapter.
+            revision: The revision; None for the current one.
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            The adapter.
+
+        Raises:
+            NotFoundError: There is no such adapter.
+
+        Example:
+            >>> client.adapter("robot").test.overall
+        """
+        request = catalog_pb2.GetAdapterRequest(adapter=adapter, adapter_revision=revision)
+        return Adapter.of(await self._ask(self._catalog.GetAdapter, request, deadline_s))
 
     async def frames(
         self,
         room: str,
         *,
-        neighbours_within: float | None = None,
+        room_revision: int | None = None,
+        neighbors_within: float | None = None,
         thumbnail_width: int | None = None,
         deadline_s: float | None = None,
     ) -> answers.RoomFrames:
-        """All frames of a room with their poses; with `neighbours_within`, a norm of motions, also the pose graph."""
+        """All frames of a room with their poses.
+
+        Args:
+            room: The room.
+            room_revision: The revision of the room; None for the current one.
+            neighbors_within: Also return the neighbors of each frame to which the motion has at most this norm,
+                meters and radians mixed.
+            thumbnail_width: Also return a JPEG of this width for each frame, 16 to 512 pixels.
+            deadline_s: Time limit of each page, seconds; None for that of the client.
+
+        Returns:
+            The frames, a row each.
+
+        Raises:
+            RefusedError: The server refused the request, for instance because it shows no thumbnails.
+
+        Example:
+            >>> client.frames("kitchen").poses.shape
+        """
         request = catalog_pb2.ListFramesRequest(
-            room=room, neighbours_within=neighbours_within, thumbnail_width=thumbnail_width
+            room=room, room_revision=room_revision, neighbors_within=neighbors_within, thumbnail_width=thumbnail_width
         )
         frames: list[catalog_pb2.RoomFrame] = []
         for _ in range(MOST_PAGES):
             page = await self._ask(self._catalog.ListFrames, request, deadline_s)
             frames.extend(page.frames)
             if not page.next_page_token:
-                with_neighbours = neighbours_within is not None
+                with_neighbors = neighbors_within is not None
                 with_thumbnails = thumbnail_width is not None
-                return answers.RoomFrames.of(page.room, frames, with_neighbours, with_thumbnails)
+                return answers.RoomFrames.of(page.room, frames, with_neighbors, with_thumbnails)
             _go_on(request, page.next_page_token)
         raise errors.AnswerError(f"the server's list has more than {MOST_PAGES} pages")
 
-    async def create_room(
+    async def upload_room(
         self,
-        name: str,
+        room: str,
         upload: Upload,
         *,
-        encode_for: str = "",
+        mode: UploadMode = "create",
+        encode_for: str | None = None,
         format: str = "",
-        licence: str = "",
+        license: str = "",
         camera: Camera | None = None,
-        extend: bool = False,
         drop_other_features: bool = False,
         validate_only: bool = False,
-        request_id: str = "",
-        deadline_s: float = float("inf"),
+        request_id: str | None = None,
+        deadline_s: float | None = None,
     ) -> Publication:
-        """Uploads a room, or with `extend` more frames of it; images, not features, with `encode_for`, an adapter.
+        """Uploads a room.
 
-        Names of rooms and adapters are plain here, without "rooms/" before them. The deadline is none unless it is
-        given.
+        Args:
+            room: The name of the room.
+            upload: The frames, with features or images.
+            mode: "create" refuses a room that exists with other content, "replace" publishes a new revision of one
+                that exists, and "extend" appends the frames to it.
+            encode_for: The adapter for which the server encodes the images of the upload.
+            format: The data set format of the recording; empty with "extend".
+            license: The terms under which the recording may be used; empty with "extend".
+            camera: The camera of all images, if it is known.
+            drop_other_features: With "extend", whether the new revision may lack features that the upload has not.
+            validate_only: Whether everything is checked and nothing is stored.
+            request_id: An id by which the same change is known when it is sent again; None to make one up.
+            deadline_s: Time limit of the call, seconds; None for no limit.
+
+        Returns:
+            The revision.
+
+        Raises:
+            ExistsError: The room exists with other content.
+            RefusedError: The server refused the upload; `field` names what to change.
+
+        Example:
+            >>> client.upload_room("kitchen", Upload(poses, images=sorted(folder.glob("*.jpg"))), encode_for="robot")
         """
-        room = catalog_pb2.RoomUpload(
-            name=_resource("rooms", name),
+        described = catalog_pb2.RoomUpload(
+            room=room,
+            mode=enum_value(catalog_pb2.UploadMode, "UPLOAD_MODE_", mode, "mode"),
             features=[requests.feature_source(source) for source, _ in upload.features],
-            encode_for=f"adapters/{encode_for}" if encode_for else "",
+            encode_for=encode_for,
             format=format,
-            licence=licence,
+            license=license,
             camera=requests.wire_camera(camera),
             request_id=request_id or requests.new_id(),
             validate_only=validate_only,
-            extend=extend,
             drop_other_features=drop_other_features,
         )
-        messages = upload.messages(room)
-        return Publication.of(await self._ask(self._catalog.CreateRoom, messages, deadline_s))
+        messages = upload.messages(described)
+        return Publication.of(await self._ask(self._catalog.UploadRoom, messages, _no_limit(deadline_s)))
 
-    async def publish_adapter(
+    async def upload_adapter(
         self,
-        name: str,
+        adapter: str,
         manifest: bytes,
         weights: bytes,
         *,
+        mode: UploadMode = "create",
         validate_only: bool = False,
-        request_id: str = "",
-        deadline_s: float = float("inf"),
+        request_id: str | None = None,
+        deadline_s: float | None = None,
     ) -> Publication:
-        """Uploads an adapter by the two files that a store has of it, see `Store.adapter_files`.
+        """Uploads an adapter that was trained elsewhere.
 
-        The deadline is none unless it is given.
+        Args:
+            adapter: The name of the adapter.
+            manifest: The manifest of a revision in another store, see `Store.adapter_files`.
+            weights: The weights of that revision.
+            mode: "create" refuses an adapter that exists with other content, "replace" publishes a new revision of
+                one that exists.
+            validate_only: Whether everything is checked and nothing is stored.
+            request_id: An id by which the same change is known when it is sent again; None to make one up.
+            deadline_s: Time limit of the call, seconds; None for no limit.
+
+        Returns:
+            The revision.
+
+        Raises:
+            ExistsError: The adapter exists with other content.
+            RefusedError: The server refused the upload; `field` names what to change.
+
+        Example:
+            >>> client.upload_adapter("robot", *Store("store").adapter_files("robot"))
         """
         upload = catalog_pb2.AdapterUpload(
-            name=_resource("adapters", name),
+            adapter=adapter,
+            mode=enum_value(catalog_pb2.UploadMode, "UPLOAD_MODE_", mode, "mode"),
             manifest=manifest,
             request_id=request_id or requests.new_id(),
             validate_only=validate_only,
         )
-        messages = [catalog_pb2.PublishAdapterRequest(adapter=upload)]
+        messages = [catalog_pb2.UploadAdapterRequest(adapter=upload)]
         for start in range(0, len(weights), requests.UPLOAD_BYTES):
             part = weights[start : start + requests.UPLOAD_BYTES]
-            messages.append(catalog_pb2.PublishAdapterRequest(weights=part))
-        return Publication.of(await self._ask(self._catalog.PublishAdapter, iter(messages), deadline_s))
+            messages.append(catalog_pb2.UploadAdapterRequest(weights=part))
+        return Publication.of(await self._ask(self._catalog.UploadAdapter, iter(messages), _no_limit(deadline_s)))
 
-    async def refit_room(
+    async def fit_adapter(
         self,
-        name: str,
+        room: str,
         *,
-        base_adapter: str = "",
-        features: str = "",
-        fitted_adapter: str = "",
+        base_adapter: str | None = None,
+        features: str | None = None,
+        fitted_adapter: str | None = None,
         seed: int = 0,
         validate_only: bool = False,
-        request_id: str = "",
+        request_id: str | None = None,
         on_progress: Callable[[int, int], None] | None = None,
         deadline_s: float | None = None,
     ) -> Publication:
-        """Fits an adapter to all frames of a room, and publishes it. The deadline is none unless it is given."""
-        request = catalog_pb2.RefitRoomRequest(
-            name=f"rooms/{name}",
-            base_adapter=f"adapters/{base_adapter}" if base_adapter else "",
+        """Fits an adapter to all frames of a room, and publishes it.
+
+        Args:
+            room: The room.
+            base_adapter: The pre-trained adapter of other rooms to start from; None to start from random weights.
+            features: The feature set; None if there is a base adapter or only one set.
+            fitted_adapter: The name of the adapter to publish; None for "ROOM.FEATURES.fitted".
+            seed: The seed of the fit.
+            validate_only: Whether everything is checked, and nothing is fitted or stored.
+            request_id: An id by which the same change is known when it is sent again; None to make one up.
+            on_progress: Called with the number of epochs that are done, and of all.
+            deadline_s: Time limit of the call, seconds; None for no limit.
+
+        Returns:
+            The revision of the fitted adapter.
+
+        Raises:
+            RefusedError: The server refused the request; `field` names what to change.
+
+        Example:
+            >>> client.fit_adapter("kitchen").revision
+        """
+        request = catalog_pb2.FitAdapterRequest(
+            room=room,
+            base_adapter=base_adapter,
             features=features,
-            fitted_adapter=f"adapters/{fitted_adapter}" if fitted_adapter else "",
+            fitted_adapter=fitted_adapter,
             seed=seed,
             request_id=request_id or requests.new_id(),
             validate_only=validate_only,
         )
-        call = self._catalog.RefitRoom(request, timeout=channel.timeout(deadline_s), metadata=self._metadata)
+        call = self._catalog.FitAdapter(request, timeout=channel.timeout(deadline_s), metadata=self._metadata)
         async for message in self._listen(call):
             if message.HasField("result"):
                 return Publication.of(message.result)
@@ -588,68 +996,165 @@ class AsyncClient:
     async def set_default(
         self,
         *,
-        room: str = "",
+        room: str | None = None,
+        adapter: str | None = None,
         revision: int | None = None,
-        adapter: str = "",
-        request_id: str = "",
+        validate_only: bool = False,
+        request_id: str | None = None,
         deadline_s: float | None = None,
-    ) -> list[Default]:
-        """Chooses the adapter that answers in a room, or the revision that a room's or an adapter's name means.
+    ) -> list[CatalogDefault]:
+        """Sets the default adapter of a room, or the default revision of a room or an adapter.
 
-        With `room` and `adapter`: the room's adapter. With one of them and `revision`: its revision.
+        Args:
+            room: The room.
+            adapter: The adapter that is used in `room` when a request names none; or, without `room`, the adapter
+                whose default revision is set.
+            revision: The revision that the name of `room` or `adapter` alone refers to.
+            validate_only: Whether everything is checked and nothing is stored.
+            request_id: An id by which the same change is known when it is sent again; None to make one up.
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            All current defaults.
+
+        Raises:
+            RefusedError: The server refused the change; `field` names what to change.
+            ValueError: Not exactly two of `room`, `adapter` and `revision` are given.
+
+        Example:
+            >>> client.set_default(room="kitchen", adapter="robot")
         """
-        if bool(room) + bool(adapter) + (revision is not None) != 2:
-            raise ValueError("give room and adapter, or one of them and revision; `unset_default` takes a choice back")
+        if (room is not None) + (adapter is not None) + (revision is not None) != 2:
+            raise ValueError("give room and adapter, or one of them and revision")
 
+        default = catalog_pb2.CatalogDefault()
+        if revision is None:
+            default.room_adapter.room, default.room_adapter.adapter = room or "", adapter or ""
+        else:
+            of = default.adapter_revision if room is None else default.room_revision
+            of.name, of.revision = room or adapter or "", revision
         request = catalog_pb2.SetDefaultRequest(
-            name=f"rooms/{room}" if room else f"adapters/{adapter}",
-            revision=revision,
-            adapter=f"adapters/{adapter}" if room and adapter else None,
+            default=default, validate_only=validate_only, request_id=request_id or requests.new_id()
+        )
+        answer = await self._ask(self._catalog.SetDefault, request, deadline_s)
+        return [CatalogDefault.of(default) for default in answer.defaults]
+
+    async def clear_default(
+        self,
+        *,
+        adapter_of_room: str | None = None,
+        room: str | None = None,
+        adapter: str | None = None,
+        validate_only: bool = False,
+        request_id: str | None = None,
+        deadline_s: float | None = None,
+    ) -> list[CatalogDefault]:
+        """Clears a default. Exactly one of the first three arguments is required.
+
+        Args:
+            adapter_of_room: The room whose default adapter is cleared.
+            room: The room whose default revision is cleared.
+            adapter: The adapter whose default revision is cleared.
+            validate_only: Whether everything is checked and nothing is stored.
+            request_id: An id by which the same change is known when it is sent again; None to make one up.
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            All current defaults.
+
+        Raises:
+            RefusedError: The server refused the change.
+            ValueError: Not exactly one default is named.
+
+        Example:
+            >>> client.clear_default(adapter_of_room="kitchen")
+        """
+        if (adapter_of_room is not None) + (room is not None) + (adapter is not None) != 1:
+            raise ValueError("give exactly one of adapter_of_room, room and adapter")
+        request = catalog_pb2.ClearDefaultRequest(
+            room_adapter=adapter_of_room,
+            room_revision=room,
+            adapter_revision=adapter,
+            validate_only=validate_only,
             request_id=request_id or requests.new_id(),
         )
-        answer = await self._ask(self._catalog.SetDefault, request, deadline_s)
-        return [Default.of(default) for default in answer.defaults]
-
-    async def unset_default(
-        self, *, room: str = "", adapter: str = "", request_id: str = "", deadline_s: float | None = None
-    ) -> list[Default]:
-        """Chooses nothing for a room or an adapter any more: its name means its newest revision again."""
-        if bool(room) == bool(adapter):
-            raise ValueError("give exactly one of room and adapter")
-        request = catalog_pb2.SetDefaultRequest(
-            name=f"rooms/{room}" if room else f"adapters/{adapter}", request_id=request_id or requests.new_id()
-        )
-        answer = await self._ask(self._catalog.SetDefault, request, deadline_s)
-        return [Default.of(default) for default in answer.defaults]
-
-    async def roll_back_default(self, *, request_id: str = "", deadline_s: float | None = None) -> list[Default]:
-        """Takes the last change of defaults back."""
-        request = catalog_pb2.RollBackDefaultRequest(request_id=request_id or requests.new_id())
-        answer = await self._ask(self._catalog.RollBackDefault, request, deadline_s)
-        return [Default.of(default) for default in answer.defaults]
+        answer = await self._ask(self._catalog.ClearDefault, request, deadline_s)
+        return [CatalogDefault.of(default) for default in answer.defaults]
 
     async def delete_room(
-        self, name: str, *, revision: int | None = None, request_id: str = "", deadline_s: float | None = None
+        self,
+        room: str,
+        *,
+        revision: int | None = None,
+        validate_only: bool = False,
+        request_id: str | None = None,
+        deadline_s: float | None = None,
     ) -> list[int]:
-        """Removes a room, or one revision of it, and returns the numbers of the revisions that were removed."""
+        """Removes a room, or one revision of it.
+
+        Args:
+            room: The name of the room.
+            revision: The revision to remove; None for all.
+            validate_only: Whether everything is checked and nothing is removed.
+            request_id: An id by which the same change is known when it is sent again; None to make one up.
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            The numbers of the removed revisions.
+
+        Raises:
+            RefusedError: The server refused the change, for instance because the revision is a default.
+
+        Example:
+            >>> client.delete_room("kitchen", revision=1)
+        """
         request = catalog_pb2.DeleteRoomRequest(
-            name=_resource("rooms", name, revision), request_id=request_id or requests.new_id()
+            room=_name(room),
+            room_revision=revision,
+            validate_only=validate_only,
+            request_id=request_id or requests.new_id(),
         )
         return list((await self._ask(self._catalog.DeleteRoom, request, deadline_s)).revisions)
 
     async def delete_adapter(
-        self, name: str, *, revision: int | None = None, request_id: str = "", deadline_s: float | None = None
+        self,
+        adapter: str,
+        *,
+        revision: int | None = None,
+        validate_only: bool = False,
+        request_id: str | None = None,
+        deadline_s: float | None = None,
     ) -> list[int]:
-        """Removes an adapter, or one revision of it, and returns the numbers of the revisions that were removed."""
+        """Removes an adapter, or one revision of it.
+
+        Args:
+            adapter: The name of the adapter.
+            revision: The revision to remove; None for all.
+            validate_only: Whether everything is checked and nothing is removed.
+            request_id: An id by which the same change is known when it is sent again; None to make one up.
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            The numbers of the removed revisions.
+
+        Raises:
+            RefusedError: The server refused the change, for instance because the adapter is a default.
+
+        Example:
+            >>> client.delete_adapter("robot", revision=1)
+        """
         request = catalog_pb2.DeleteAdapterRequest(
-            name=_resource("adapters", name, revision), request_id=request_id or requests.new_id()
+            adapter=_name(adapter),
+            adapter_revision=revision,
+            validate_only=validate_only,
+            request_id=request_id or requests.new_id(),
         )
         return list((await self._ask(self._catalog.DeleteAdapter, request, deadline_s)).revisions)
 
 
-def _stub(kind: Any, channel: Any) -> Any:
-    """A stub of a service; what protoc writes has no types."""
-    return kind(channel)
+def _no_limit(deadline_s: float | None) -> float:
+    """The deadline of a call that has none of its own."""
+    return float("inf") if deadline_s is None else deadline_s
 
 
 def _go_on(request: Any, token: str) -> None:
@@ -659,10 +1164,11 @@ def _go_on(request: Any, token: str) -> None:
     request.page_token = token
 
 
-def _resource(collection: str, name: str, revision: int | None = None) -> str:
+def _name(name: str) -> str:
+    # An omitted name would be a protobuf default, and an error of the server.
     if not isinstance(name, str):
-        raise TypeError(f"name: is the name of one of the {collection}, not {name!r}")
-    return f"{collection}/{name}" + ("" if revision is None else f"/revisions/{revision}")
+        raise TypeError(f"a name is text, not {name!r}")
+    return name
 
 
 class AsyncTrack:
@@ -670,9 +1176,9 @@ class AsyncTrack:
 
     A stream that is cut (the server was restarted, the network was gone for a moment) is opened again by the token of
     its last answer, and the frames since then are sent again. The map pose goes on, and the odometry frame begins anew.
-    `resumed` counts how often that was done. `resume_token`, and `last_sequence`, the number of the last frame, carry
-    the stream on in another program. `start` says what the server chose. One stream is for one thread, or one task, at
-    a time.
+    `resumed` counts how often that was done. `resume_token` and `last_sequence_number`, the number of the last frame,
+    carry the stream on in another program. `start` has the choices of the server. A stream is for one thread, or one
+    task, at a time.
     """
 
     def __init__(
@@ -680,14 +1186,14 @@ class AsyncTrack:
         method: Any,
         metadata: list[tuple[str, str]],
         config: odometry_pb2.TrackConfig,
-        last_sequence: int,
+        last_sequence_number: int,
         deadline_s: float | None,
     ) -> None:
         self._method = method
         self._deadline_s = deadline_s
         self._metadata = metadata
         self._config = config
-        self.last_sequence = last_sequence
+        self.last_sequence_number = last_sequence_number
         # What was answered since the last token, and what has no answer yet: both are sent again when a stream is cut.
         self._unsaved: deque[odometry_pb2.TrackRequest] = deque(maxlen=MOST_UNSAVED)
         self._awaited: deque[odometry_pb2.TrackRequest] = deque()
@@ -724,7 +1230,7 @@ class AsyncTrack:
         view: View,
         timestamp_ns: int,
         *,
-        sequence: int | None = None,
+        sequence_number: int | None = None,
         odometry: Odometry | None = None,
         gravity: Gravity | None = None,
         other_views: dict[str, View] | None = None,
@@ -742,10 +1248,12 @@ class AsyncTrack:
         within the deadline of opening it. A step that raises, or that is given
         up, did not happen: the frame may be sent again.
         """
-        frame = self._frame(view, timestamp_ns, sequence, odometry, gravity, other_views, inertial, exposure_ns, depth)
+        frame = self._frame(
+            view, timestamp_ns, sequence_number, odometry, gravity, other_views, inertial, exposure_ns, depth
+        )
         await self._drain()
         await self._send(frame)
-        return await self._receive(channel.timeout(deadline_s))
+        return await self._receive_of_frame(channel.timeout(deadline_s))
 
     async def follow(
         self, frames: AsyncIterable[tuple[int, View]], *, ahead: int = 0
@@ -764,9 +1272,9 @@ class AsyncTrack:
         async for timestamp_ns, view in frames:
             await self._send(self._frame(view, timestamp_ns))
             if len(self._awaited) > ahead:
-                yield await self._receive()
+                yield await self._receive_of_frame()
         while self._awaited:
-            yield await self._receive()
+            yield await self._receive_of_frame()
 
     async def set_initial_pose(self, pose: InitialPose) -> None:
         """Tells where the camera is now."""
@@ -830,7 +1338,7 @@ class AsyncTrack:
         self,
         view: View,
         timestamp_ns: int,
-        sequence: int | None = None,
+        sequence_number: int | None = None,
         odometry: Odometry | None = None,
         gravity: Gravity | None = None,
         other_views: dict[str, View] | None = None,
@@ -838,11 +1346,11 @@ class AsyncTrack:
         exposure_ns: int = 0,
         depth: DepthImage | None = None,
     ) -> odometry_pb2.TrackRequest:
-        number = self.last_sequence + 1 if sequence is None else sequence
+        number = self.last_sequence_number + 1 if sequence_number is None else sequence_number
         frame = requests.track_frame(
             view, timestamp_ns, number, odometry, gravity, other_views or {}, inertial, exposure_ns, depth
         )
-        self.last_sequence = number
+        self.last_sequence_number = number
         return frame
 
     async def _exchange(self, request: odometry_pb2.TrackRequest) -> TrackRefusal | None:
@@ -865,8 +1373,15 @@ class AsyncTrack:
         self._awaited.append(request)
         await self._requests.put(request)
 
-    async def _receive(self, deadline_s: float | None = None) -> TrackUpdate | TrackRefusal:
-        """What the server says of the oldest request that has no answer yet."""
+    async def _receive_of_frame(self, deadline_s: float | None = None) -> TrackUpdate | TrackRefusal:
+        """The answer to the oldest request without one, which is a frame."""
+        answer = await self._receive(deadline_s)
+        if answer is None:
+            raise errors.AnswerError("the server answered a frame as if it were another message")
+        return answer
+
+    async def _receive(self, deadline_s: float | None = None) -> TrackUpdate | TrackRefusal | None:
+        """The answer to the oldest request without one; None for an acknowledgement."""
         if self._is_busy:
             raise errors.SeeseError("the stream waits for an answer already: one stream is for one thread or task")
         self._is_busy = True
@@ -891,14 +1406,16 @@ class AsyncTrack:
         self._note(answer)
         return said
 
-    def _understood(self, answer: odometry_pb2.TrackResponse) -> TrackUpdate | TrackRefusal:
-        """What an answer says; it has to be that of the oldest request without one."""
+    def _understood(self, answer: odometry_pb2.TrackResponse) -> TrackUpdate | TrackRefusal | None:
+        """What an answer says; it has to be that of the oldest request without one. None for an acknowledgement."""
         if answer.HasField("refusal"):
             return TrackRefusal.of(answer.refusal)
+        if answer.HasField("acknowledged"):
+            return None
         asked, update = self._awaited[0], answer.update
-        if asked.HasField("frame") and update.sequence != asked.frame.sequence:
+        if asked.HasField("frame") and update.sequence_number != asked.frame.sequence_number:
             raise errors.AnswerError(
-                f"the server answered frame {update.sequence} where frame {asked.frame.sequence} was sent"
+                f"the server answered frame {update.sequence_number} where frame {asked.frame.sequence_number} was sent"
             )
         return TrackUpdate.of(update)
 
@@ -906,7 +1423,7 @@ class AsyncTrack:
         # A number that is never sent would count as a frame that is missing.
         for request in reversed(self._awaited):
             if request.HasField("frame"):
-                self.last_sequence = request.frame.sequence - 1
+                self.last_sequence_number = request.frame.sequence_number - 1
         self._awaited.clear()
 
     async def _answer(self, deadline_s: float | None) -> odometry_pb2.TrackResponse:

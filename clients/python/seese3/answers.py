@@ -7,8 +7,8 @@ tables need the extras `seese3[plots]` and `seese3[pandas]`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,8 @@ from . import errors
 from .errors import understood
 from .geometry import Array, covariance_matrix, pose_matrix, twist_vector
 from .v1 import catalog_pb2, evaluation_pb2, geometry_pb2, localization_pb2, navigation_pb2, odometry_pb2
-from .views import Feature, Latent
+from .views import Feature, Latent, Revision
+from .words import DistortionModel, FinalNorm, LayerIndexBase, enum_word
 
 if TYPE_CHECKING:
     import pandas
@@ -31,27 +32,8 @@ def _known(message: Any, field: str) -> Any:
     return getattr(message, field) if message.HasField(field) else None
 
 
-def _word(enum: Any, value: int, prefix: str) -> str:
-    """A value of an enum as a word: TRACK_STATUS_LOST is "lost"."""
-    try:
-        name: str = enum.Name(value)
-    except ValueError:
-        # Of a server that is newer than this package.
-        return f"unknown_{value}"
-    return name.removeprefix(prefix).lower()
-
-
-@dataclass(frozen=True)
-class Revision:
-    """A published version of a room or an adapter, which never changes."""
-
-    name: str
-    revision: int
-
-    @classmethod
-    @understood
-    def of(cls, message: geometry_pb2.Revision) -> Revision:
-        return cls(message.name, message.revision)
+def _word_or_none(enum: Any, value: int, prefix: str) -> Any:
+    return enum_word(enum, value, prefix) if value else None
 
 
 def _revision(message: Any, field: str) -> Revision | None:
@@ -60,12 +42,18 @@ def _revision(message: Any, field: str) -> Revision | None:
 
 @dataclass(frozen=True, eq=False)
 class PoseError:
-    """How far an answer is from what was recorded. `within` says of each threshold ε whether the error met it."""
+    """The error of an answer against a recorded pose.
+
+    Attributes:
+        translation_m: The distance between the camera centers, meters.
+        rotation_rad: The angle between the orientations, radians.
+        twist_norm: The norm of the difference of the two motions from the source, meters and radians mixed. Hit@ε
+            counts the errors below ε.
+    """
 
     translation_m: float
     rotation_rad: float
     twist_norm: float
-    within: dict[float, bool]
 
     @classmethod
     @understood
@@ -73,8 +61,7 @@ class PoseError:
         if not message.HasField(field):
             return None
         error = getattr(message, field)
-        within = {check.threshold: check.met for check in error.thresholds}
-        return cls(error.translation_m, error.rotation_rad, error.twist_norm, within)
+        return cls(error.translation_m, error.rotation_rad, error.twist_norm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,14 +96,22 @@ class FeatureSource:
     layer: str = "unspecified"
     pooling: str = "unspecified"
     preprocess: str = "unspecified"
-    base: str = "unspecified"
-    norm: str = "unspecified"
+    layer_index_base: LayerIndexBase | None = None
+    final_norm: FinalNorm | None = None
 
     @classmethod
     @understood
     def of(cls, message: catalog_pb2.FeatureSource) -> FeatureSource:
-        fields = cls.__dataclass_fields__
-        return cls(**{name: getattr(message, name) for name in fields})
+        return cls(
+            name=message.name,
+            dim=message.dim,
+            encoder=message.encoder,
+            layer=message.layer,
+            pooling=message.pooling,
+            preprocess=message.preprocess,
+            layer_index_base=_word_or_none(catalog_pb2.LayerIndexBase, message.layer_index_base, "LAYER_INDEX_BASE_"),
+            final_norm=_word_or_none(catalog_pb2.FinalNorm, message.final_norm, "FINAL_NORM_"),
+        )
 
 
 @dataclass(frozen=True)
@@ -134,7 +129,7 @@ class Camera:
     fy: float | None = None
     cx: float | None = None
     cy: float | None = None
-    distortion_model: str | None = None
+    distortion_model: DistortionModel | None = None
     distortion: Sequence[float] = ()
 
     def __post_init__(self) -> None:
@@ -159,7 +154,6 @@ class Camera:
     @classmethod
     @understood
     def of(cls, message: geometry_pb2.CameraIntrinsics) -> Camera:
-        has_model = message.distortion_model != geometry_pb2.DISTORTION_MODEL_UNSPECIFIED
         return cls(
             message.width,
             message.height,
@@ -167,7 +161,7 @@ class Camera:
             message.fy or None,
             _known(message, "cx"),
             _known(message, "cy"),
-            _word(geometry_pb2.DistortionModel, message.distortion_model, "DISTORTION_MODEL_") if has_model else None,
+            _word_or_none(geometry_pb2.DistortionModel, message.distortion_model, "DISTORTION_MODEL_"),
             message.distortion,
         )
 
@@ -176,30 +170,30 @@ class Camera:
 class Room:
     """A room that is served. `adapters` fit its features, the default first."""
 
-    revision: Revision
+    name: str
+    revision: int
     frame_count: int
     adapters: tuple[str, ...]
     features: tuple[FeatureSource, ...]
     format: str
-    licence: str
+    license: str
     worst_rotation_deviation: float
     created: datetime
     camera: Camera | None
 
-    @property
-    def name(self) -> str:
-        return self.revision.name
-
     @classmethod
     @understood
     def of(cls, message: catalog_pb2.Room) -> Room:
+        if not message.name:
+            raise ValueError("it has no name")
         return cls(
-            Revision.of(message.revision),
+            message.name,
+            message.revision,
             message.frame_count,
             tuple(message.adapters),
             tuple(map(FeatureSource.of, message.features)),
             message.format,
-            message.licence,
+            message.license,
             message.worst_rotation_deviation,
             message.create_time.ToDatetime(timezone.utc),
             Camera.of(message.camera) if message.HasField("camera") else None,
@@ -236,7 +230,8 @@ class MotionScores:
 class Adapter:
     """A trained adapter that is served, with how it was trained and its R²."""
 
-    revision: Revision
+    name: str
+    revision: int
     source: FeatureSource
     latent_dim: int
     charts: int
@@ -257,25 +252,24 @@ class Adapter:
     navigators: tuple[str, ...]
     created: datetime
 
-    @property
-    def name(self) -> str:
-        return self.revision.name
-
     @classmethod
     @understood
     def of(cls, message: catalog_pb2.Adapter) -> Adapter:
+        if not message.name:
+            raise ValueError("it has no name")
         return cls(
-            revision=Revision.of(message.revision),
+            name=message.name,
+            revision=message.revision,
             source=FeatureSource.of(message.source),
             latent_dim=message.latent_dim,
             charts=message.charts,
             training_rooms=tuple(map(Revision.of, message.training_rooms)),
             calibration_rooms=tuple(map(Revision.of, message.calibration_rooms)),
             preset=message.preset,
-            split=message.split,
+            split=enum_word(geometry_pb2.Split, message.split, "SPLIT_"),
             stride=message.stride,
-            loss=message.loss,
-            mixing=message.mixing,
+            loss=enum_word(catalog_pb2.TrainingLoss, message.loss, "TRAINING_LOSS_"),
+            mixing=enum_word(catalog_pb2.ChartMixing, message.mixing, "CHART_MIXING_"),
             seed=message.seed,
             test=MotionScores.of(message.test),
             train=MotionScores.of(message.train),
@@ -290,15 +284,15 @@ class Adapter:
 
 @dataclass(frozen=True, eq=False)
 class RoomFrames:
-    """The frames of a room, a row each. `neighbours` are (row, motion) of the frames near each one, the nearest first;
+    """The frames of a room, a row each. `neighbors` are (row, motion) of the frames near each one, the nearest first;
     `thumbnails` are JPEG files. What was not asked for, or is not known, is None."""
 
     room: Revision
     poses: Array
     names: tuple[str, ...] | None
     timestamps_ns: npt.NDArray[np.int64] | None
-    sequences: npt.NDArray[np.int64]
-    neighbours: tuple[tuple[tuple[int, Array], ...], ...] | None
+    segments: npt.NDArray[np.int64]
+    neighbors: tuple[tuple[tuple[int, Array], ...], ...] | None
     thumbnails: tuple[bytes, ...] | None
 
     def __len__(self) -> int:
@@ -310,7 +304,7 @@ class RoomFrames:
         cls,
         room: geometry_pb2.Revision,
         frames: Sequence[catalog_pb2.RoomFrame],
-        with_neighbours: bool,
+        with_neighbors: bool,
         with_thumbnails: bool,
     ) -> RoomFrames:
         times = [frame.timestamp_ns for frame in frames if frame.HasField("timestamp_ns")]
@@ -320,11 +314,11 @@ class RoomFrames:
             poses=np.array([pose_matrix(frame.pose) for frame in frames]).reshape(-1, 4, 4),
             names=names if any(names) else None,
             timestamps_ns=np.array(times, dtype=np.int64) if times and len(times) == len(frames) else None,
-            sequences=np.array([frame.sequence for frame in frames], dtype=np.int64),
-            neighbours=tuple(
-                tuple((near.frame_id, twist_vector(near.motion)) for near in frame.neighbours) for frame in frames
+            segments=np.array([frame.segment for frame in frames], dtype=np.int64),
+            neighbors=tuple(
+                tuple((near.frame_id, twist_vector(near.motion)) for near in frame.neighbors) for frame in frames
             )
-            if with_neighbours
+            if with_neighbors
             else None,
             thumbnails=tuple(frame.thumbnail for frame in frames) if with_thumbnails else None,
         )
@@ -348,23 +342,84 @@ class Publication:
 
 
 @dataclass(frozen=True)
-class Default:
-    """What an operator chose for a room or an adapter: its revision, the adapter that answers in it, or both.
+class ServerEncoder:
+    """An encoder of a server.
 
-    `kind` is "room" or "adapter", and says what `name` is the name of.
+    Attributes:
+        encoder: The identity of the encoder, as in `FeatureSource.encoder`.
+        adapters: The adapters for whose features it converts images.
+        detects_keypoints: Whether it detects keypoints.
     """
 
-    kind: str
-    name: str
-    revision: int | None
-    adapter: str | None
+    encoder: str
+    adapters: tuple[str, ...]
+    detects_keypoints: bool
+
+
+@dataclass(frozen=True)
+class ServerInfo:
+    """The version, the abilities and the limits of a server.
+
+    Attributes:
+        version: The version of the program.
+        encoders: The encoders with which it converts images.
+        writable: Whether the caller may change the catalog.
+        encodes_images: Whether it converts images to features of at least one adapter.
+        matches_keypoints: Whether it matches the keypoints of images.
+        shows_thumbnails: Whether `frames` can return thumbnails.
+        limits: The limits of requests, by name: "top_k", "steps", "batch", "predictions", "message_bytes",
+            "duration_s" and "image_pixels".
+    """
+
+    version: str
+    encoders: tuple[ServerEncoder, ...]
+    writable: bool
+    encodes_images: bool
+    matches_keypoints: bool
+    shows_thumbnails: bool
+    limits: dict[str, float]
 
     @classmethod
     @understood
-    def of(cls, message: catalog_pb2.Default) -> Default:
-        collection, _, name = message.name.partition("/")
-        adapter = message.adapter.removeprefix("adapters/") or None
-        return cls(collection.removesuffix("s"), name, _known(message, "revision"), adapter)
+    def of(cls, message: catalog_pb2.ServerInfo) -> ServerInfo:
+        encoders = [ServerEncoder(one.encoder, tuple(one.adapters), one.detects_keypoints) for one in message.encoders]
+        limits = {field.name: getattr(message.limits, field.name) for field in message.limits.DESCRIPTOR.fields}
+        return cls(
+            message.version,
+            tuple(encoders),
+            message.writable,
+            message.encodes_images,
+            message.matches_keypoints,
+            message.shows_thumbnails,
+            limits,
+        )
+
+
+@dataclass(frozen=True)
+class CatalogDefault:
+    """A default of a server's catalog. Exactly one of the pairs is set.
+
+    Attributes:
+        room: The room of a default adapter or a default revision.
+        adapter: The default adapter of `room`, or the adapter of a default revision.
+        revision: The default revision of `room` or `adapter`; None for a default adapter.
+    """
+
+    room: str | None = None
+    adapter: str | None = None
+    revision: int | None = None
+
+    @classmethod
+    @understood
+    def of(cls, message: catalog_pb2.CatalogDefault) -> CatalogDefault:
+        kind = message.WhichOneof("default")
+        if kind == "room_adapter":
+            return cls(room=message.room_adapter.room, adapter=message.room_adapter.adapter)
+        if kind == "room_revision":
+            return cls(room=message.room_revision.name, revision=message.room_revision.revision)
+        if kind == "adapter_revision":
+            return cls(adapter=message.adapter_revision.name, revision=message.adapter_revision.revision)
+        raise ValueError("it names nothing that this package knows")
 
 
 @dataclass(frozen=True, eq=False)
@@ -394,9 +449,9 @@ class FittedEstimate:
 
     frame_id: int
     distance: float
-    translation_reader: str
+    translation_estimator: str
     translation_gain: float
-    rotation_reader: str
+    rotation_estimator: str
     rotation_gain: float
 
     @classmethod
@@ -404,11 +459,20 @@ class FittedEstimate:
     def of(cls, message: Any) -> FittedEstimate | None:
         if not message.HasField("fitted"):
             return None
-        return cls(**{name: getattr(message.fitted, name) for name in cls.__dataclass_fields__})
+        fitted = message.fitted
+        enum, prefix = localization_pb2.RelativeEstimator, "RELATIVE_ESTIMATOR_"
+        return cls(
+            fitted.frame_id,
+            fitted.distance,
+            enum_word(enum, fitted.translation_estimator, prefix),
+            fitted.translation_gain,
+            enum_word(enum, fitted.rotation_estimator, prefix),
+            fitted.rotation_gain,
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class SimilarFrame:
     """A frame of a room that looks like the view. `error` is there if the view is a stored frame itself."""
 
     room: Revision
@@ -423,7 +487,7 @@ class Localization:
     `pose` is None if the view is not in the map; `reason` then states why. `covariance` (6, 6) is in ROS order: x, y,
     z, and rotations about the axes of the world frame; None if the errors of the method were not measured. `novelty`
     above 1 means not in the map. `method` is "matched_keypoints", "fitted_adapter", "similar_frames", "nearest_frame"
-    or "recorded"; None without a pose. `places` are the stored frames most similar to the view, the best first.
+    or "recorded"; None without a pose. `frames` are the stored frames most similar to the view, the best first.
     """
 
     pose: Array | None
@@ -434,16 +498,16 @@ class Localization:
     reason: str | None
     matches: KeypointMatches | None
     fitted: FittedEstimate | None
-    places: tuple[Place, ...]
+    frames: tuple[SimilarFrame, ...]
     adapter: Revision | None
     room_count: int
 
     @classmethod
     @understood
     def of(cls, message: localization_pb2.LocalizeResponse) -> Localization:
-        places = tuple(
-            Place(Revision.of(place.room), Frame.of(place.frame), PoseError.of(place, "error"))
-            for place in message.places
+        frames = tuple(
+            SimilarFrame(Revision.of(similar.room), Frame.of(similar.frame), PoseError.of(similar, "error"))
+            for similar in message.frames
         )
         return cls(
             *_pose_with_covariance(message),
@@ -453,7 +517,7 @@ class Localization:
             message.reason or None,
             KeypointMatches.of(message),
             FittedEstimate.of(message),
-            places,
+            frames,
             Revision.of(message.adapter) if message.HasField("adapter") else None,
             message.room_count,
         )
@@ -468,7 +532,7 @@ def _pose_with_covariance(message: Any) -> tuple[Array | None, Array | None]:
 def _method(value: int) -> str | None:
     if value == localization_pb2.LOCALIZATION_METHOD_UNSPECIFIED:
         return None
-    return _word(localization_pb2.LocalizationMethod, value, "LOCALIZATION_METHOD_")
+    return enum_word(localization_pb2.LocalizationMethod, value, "LOCALIZATION_METHOD_")
 
 
 @dataclass(frozen=True, eq=False)
@@ -528,6 +592,10 @@ class Relocalization:
         )
 
 
+def _latent(message: geometry_pb2.Latent) -> Latent:
+    return Latent(np.array(message.values), _revision(message, "adapter"))
+
+
 @dataclass(frozen=True, eq=False)
 class Step:
     """One step of a navigation: the frames nearest to what was imagined, the best first."""
@@ -546,7 +614,7 @@ class Step:
             tuple(map(Frame.of, message.frames)),
             pose_matrix(message.requested_pose) if message.HasField("requested_pose") else None,
             PoseError.of(message, "error"),
-            Latent(np.array(message.latent.values)),
+            _latent(message.latent),
         )
 
 
@@ -556,8 +624,8 @@ class Navigation:
 
     room: Revision
     adapter: Revision
-    mode: str
-    reading: str
+    step_mode: str
+    inverse_variant: str | None
     navigator: str
     exact: bool
     _message: navigation_pb2.NavigateResponse = field(repr=False)
@@ -583,8 +651,8 @@ class Navigation:
         return cls(
             Revision.of(message.room),
             Revision.of(message.adapter),
-            _word(navigation_pb2.Mode, message.mode, "MODE_"),
-            _word(navigation_pb2.Reading, message.reading, "READING_"),
+            enum_word(navigation_pb2.StepMode, message.step_mode, "STEP_MODE_"),
+            _word_or_none(navigation_pb2.InverseVariant, message.inverse_variant, "INVERSE_VARIANT_"),
             message.navigator,
             message.exact,
             message,
@@ -594,67 +662,108 @@ class Navigation:
 def batch_of(message: navigation_pb2.BatchNavigateResponse) -> list[Navigation | errors.RefusedError]:
     """The answers of a batch in its order; a request that failed has its exception in its place."""
     return [
-        Navigation.of(result.response)
-        if result.HasField("response")
-        else errors.refused_part(result.failure.code, result.failure.message)
+        Navigation.of(result.response) if result.HasField("response") else errors.refused_part(result.error)
         for result in message.results
     ]
 
 
 @dataclass(frozen=True, eq=False)
-class WayStep:
-    """One hop of a way to a goal. The one of number 0 stands for the start, whose believed pose it has."""
+class RouteStart:
+    """The start of a route.
 
-    step: int
-    frame: Frame | None
+    Attributes:
+        pose: The camera pose of the source, world_from_camera (4, 4).
+        covariance: Its covariance (6, 6) in ROS order; None for a stored frame, for a given pose, and if the errors
+            of the method were not measured.
+        novelty: How unlike the source is to the room: above 1 it looks like another place. None if it is unknown.
+        distance_remaining_m: The distance to the goal, meters.
+        rotation_remaining_rad: The rotation to the goal, radians.
+    """
+
+    pose: Array
+    covariance: Array | None
+    novelty: float | None
+    distance_remaining_m: float
+    rotation_remaining_rad: float
+
+
+@dataclass(frozen=True, eq=False)
+class RouteHop:
+    """One hop of a route.
+
+    Attributes:
+        motion: The motion to drive (6,), in the body frame of the camera before the hop.
+        frame: The stored frame at the end of the hop.
+        distance_remaining_m: The distance from there to the goal, meters.
+        rotation_remaining_rad: The rotation from there to the goal, radians.
+        recoveries: The number of recoveries so far; 0 except with the planner "latent".
+    """
+
     motion: Array
+    frame: Frame
     distance_remaining_m: float
     rotation_remaining_rad: float
     recoveries: int
-    start_pose: Array | None
-    start_covariance: Array | None
-    out_of_distribution: float | None
 
     @classmethod
     @understood
-    def of(cls, message: navigation_pb2.NavigateToFeedback) -> WayStep:
-        start = message.start if message.HasField("start") else None
+    def of(cls, message: navigation_pb2.RouteHop) -> RouteHop:
         return cls(
-            message.current_step,
-            Frame.of(message.current) if message.HasField("current") else None,
             twist_vector(message.motion),
+            Frame.of(message.frame),
             message.distance_remaining_m,
             message.rotation_remaining_rad,
-            message.number_of_recoveries,
-            pose_matrix(start.pose) if start else None,
-            covariance_matrix(start.pose_covariance) if start else None,
-            _known(start, "out_of_distribution") if start else None,
+            message.recoveries,
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
-    """A way to a goal. `outcome` is "reached", "stuck", "steps_spent", "start_unknown" or "goal_not_mapped"."""
+class Route:
+    """A route over stored frames to a goal.
 
-    room: Revision
-    adapter: Revision
-    steps: tuple[WayStep, ...]
+    Attributes:
+        outcome: "found", "start_unknown", "goal_not_mapped" or "no_route".
+        message: The outcome in a few words.
+        start: The start of the route.
+        hops: The hops, in order; empty unless `outcome` is "found".
+        needed_hop_length: The maximum hop length that a route needs; None if it is at most the one asked for.
+        arrival_probability: The probability that a camera which drives the route without looking again ends within
+            the tolerances; None if the start has no covariance.
+        room: The room of the route.
+        adapter: The adapter that was used.
+        planning_time_s: The time that planning took, seconds.
+    """
+
     outcome: str
     message: str
-    needed_step: float | None
+    start: RouteStart
+    hops: tuple[RouteHop, ...]
+    needed_hop_length: float | None
     arrival_probability: float | None
+    room: Revision
+    adapter: Revision
+    planning_time_s: float
 
     @classmethod
     @understood
-    def of(cls, steps: Iterable[WayStep], message: navigation_pb2.NavigateToResult) -> Way:
+    def of(cls, message: navigation_pb2.Route) -> Route:
+        start = message.start
         return cls(
+            enum_word(navigation_pb2.RouteOutcome, message.outcome, "ROUTE_OUTCOME_"),
+            message.message,
+            RouteStart(
+                pose_matrix(start.pose.pose),
+                covariance_matrix(start.pose.covariance),
+                _known(start, "novelty"),
+                start.distance_remaining_m,
+                start.rotation_remaining_rad,
+            ),
+            tuple(map(RouteHop.of, message.hops)),
+            _known(message, "needed_hop_length"),
+            _known(message, "arrival_probability"),
             Revision.of(message.room),
             Revision.of(message.adapter),
-            tuple(steps),
-            _word(navigation_pb2.NavigateToOutcome, message.outcome, "NAVIGATE_TO_OUTCOME_"),
-            message.message,
-            _known(message, "needed_step"),
-            _known(message, "arrival_probability"),
+            message.planning_time_ns / 1e9,
         )
 
 
@@ -662,14 +771,15 @@ class Way:
 class Motion:
     """The motion (6,) from one view to another.
 
-    `reader` is "adapter", "two_view" (matched keypoints), or "none": the views have too little in common.
+    `covariance` (6, 6) is that of the six numbers; None if an adapter estimated the motion. `estimator` is "adapter",
+    "two_view" (matched keypoints), or "none": the views have too little in common.
     """
 
     twist: Array
     covariance: Array | None
     true_motion: Array | None
     error: PoseError | None
-    reader: str
+    estimator: str
     adapter: Revision | None
 
     @classmethod
@@ -678,11 +788,11 @@ class Motion:
         if not message.HasField("motion"):
             raise ValueError("it has no motion")
         return cls(
-            twist_vector(message.motion),
-            covariance_matrix(message.covariance),
+            twist_vector(message.motion.twist),
+            covariance_matrix(message.motion.covariance),
             twist_vector(message.true_motion) if message.HasField("true_motion") else None,
             PoseError.of(message, "error"),
-            _word(odometry_pb2.MotionReader, message.reader, "MOTION_READER_"),
+            enum_word(odometry_pb2.MotionEstimator, message.estimator, "MOTION_ESTIMATOR_"),
             _revision(message, "adapter"),
         )
 
@@ -694,6 +804,10 @@ class Encoding:
     adapter: Revision
     latents: Array
     features: tuple[Feature | None, ...] | None
+
+    def latent(self, row: int) -> Latent:
+        """One of the latents as a view, with the name of its adapter."""
+        return Latent(self.latents[row], self.adapter)
 
     @classmethod
     @understood
@@ -716,7 +830,7 @@ class TrackStart:
 
     - `adapter`: None if the stream tracks by matched keypoints alone.
     - `room`: None if it is not known yet, and the camera has to be found.
-    - `keyframe_displacement`, `keyframe_frames`: a new keyframe is taken after a motion of this norm, metres and
+    - `keyframe_displacement`, `keyframe_frames`: a new keyframe is taken after a motion of this norm, meters and
       radians mixed, and after the time of so many frames.
     - `calibration_rooms`: in how many rooms the covariances were calibrated.
     - `has_visual_odometry`: whether the motion between images is measured; not of features and latents.
@@ -743,101 +857,171 @@ class TrackStart:
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
-    """A room that a camera which is lost may be in: so many of the frames that are needed agree on it."""
+class TrackedBody:
+    """The poses and the velocity of the camera or of the robot's base. Covariances (6, 6) of poses are in ROS order.
+
+    Attributes:
+        odom_pose: The pose in the odometry frame (4, 4): continuous, and drifting.
+        odom_covariance: Its covariance.
+        map_pose: The pose in the map frame (4, 4); None if it is unknown. Check the status before using it.
+        map_covariance: Its covariance; None if the pose is unknown.
+        velocity: The velocity (6,) in the body frame, m/s and rad/s; None for the first frame.
+        velocity_covariance: Its covariance, on (v, ω).
+    """
+
+    odom_pose: Array
+    odom_covariance: Array | None
+    map_pose: Array | None
+    map_covariance: Array | None
+    velocity: Array | None
+    velocity_covariance: Array | None
+
+    @classmethod
+    @understood
+    def of(cls, message: odometry_pb2.TrackedBody) -> TrackedBody:
+        has_map, has_velocity = message.HasField("map_pose"), message.HasField("velocity")
+        return cls(
+            pose_matrix(message.odom_pose.pose),
+            covariance_matrix(message.odom_pose.covariance),
+            pose_matrix(message.map_pose.pose) if has_map else None,
+            covariance_matrix(message.map_pose.covariance) if has_map else None,
+            twist_vector(message.velocity.twist) if has_velocity else None,
+            covariance_matrix(message.velocity.covariance) if has_velocity else None,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeMotion:
+    """The motion of the camera since the keyframe.
+
+    Attributes:
+        motion: The motion (6,) from the keyframe to this frame, in the keyframe's body frame.
+        covariance: Its covariance (6, 6), on (v, ω).
+        sequence_number: The number of the keyframe.
+        is_new: Whether this frame is the keyframe from now on.
+    """
+
+    motion: Array
+    covariance: Array | None
+    sequence_number: int
+    is_new: bool
+
+
+@dataclass(frozen=True, eq=False)
+class TrackMatch:
+    """The comparison of a frame's views with the room.
+
+    Attributes:
+        novelty: How unlike the view is to the room: above 1 it looks like another place. None if it is unknown.
+        frame: The most similar stored frame; None if the room is unknown.
+        used: Whether the located pose corrected the map pose.
+        mahalanobis_squared: The squared Mahalanobis distance between the located and the predicted pose, χ² with six
+            degrees of freedom; None without both.
+        camera: The other camera of the view; None for the stream's own.
+    """
+
+    novelty: float | None
+    frame: Frame | None
+    used: bool
+    mahalanobis_squared: float | None
+    camera: str | None
+
+
+@dataclass(frozen=True, eq=False)
+class PoseHypothesis:
+    """A map pose that recent matches support and that is not applied yet.
+
+    Attributes:
+        room: The room of the hypothesis.
+        map_from_camera: The camera pose (4, 4) at the last frame that supported it.
+        sequence_number: The number of that frame.
+        agreed: The number of successive matches that agree.
+        needed: The number of matches that must agree.
+    """
 
     room: Revision
     map_from_camera: Array
-    sequence: int
+    sequence_number: int
     agreed: int
     needed: int
 
 
 @dataclass(frozen=True, eq=False)
 class TrackUpdate:
-    """Where a tracked camera is. `status` is "tracking", "degraded", "lost" or "relocalizing"; only while it is
-    "tracking" should a robot rely on `map_from_camera`. Velocities are (6,) in m/s and rad/s, in the body frame.
-    `contradicted` are the sensors that contradict the others or the pose: "odometry", "images", "inertial", "gravity"
-    or "views"."""
+    """The answer to a frame of a tracked camera.
+
+    Attributes:
+        timestamp_ns: The time of the frame, nanoseconds.
+        sequence_number: The number of the frame.
+        status: "tracking", "degraded", "lost" or "relocalizing"; only while it is "tracking" should a robot rely on
+            the map pose.
+        reason: The reason for the status; None if there is none.
+        contradicted: The sensors that contradict the others or the pose: "odometry", "images", "inertial", "gravity"
+            or "views".
+        room: The room of the camera; None if it is unknown.
+        camera: The poses and the velocity of the camera.
+        base: Those of the robot's base; None without `base_from_camera`.
+        map_from_odom: The drift correction (4, 4); None if the map pose is unknown.
+        keyframe: The motion since the keyframe.
+        match: The comparison of the views with the room.
+        hypothesis: Another map pose that recent matches support; None if there is none.
+        elapsed_ns: The time from the arrival of the frame to its answer, nanoseconds.
+    """
 
     timestamp_ns: int
-    sequence: int
+    sequence_number: int
     status: str
     reason: str | None
-    room: Revision | None
-    map_from_camera: Array | None
-    map_from_camera_covariance: Array | None
-    map_from_odom: Array | None
-    odom_from_camera: Array | None
-    odom_from_camera_covariance: Array | None
-    map_from_base: Array | None
-    map_from_base_covariance: Array | None
-    odom_from_base: Array | None
-    motion: Array
-    motion_covariance: Array | None
-    body_velocity: Array | None
-    base_velocity: Array | None
-    keyframe_sequence: int
-    is_keyframe: bool
-    out_of_distribution: float
-    best_match: Frame | None
-    best_camera: str | None
-    match_used: bool
-    match_surprise: float | None
-    candidate: Candidate | None
     contradicted: tuple[str, ...]
+    room: Revision | None
+    camera: TrackedBody
+    base: TrackedBody | None
+    map_from_odom: Array | None
+    keyframe: KeyframeMotion
+    match: TrackMatch
+    hypothesis: PoseHypothesis | None
     elapsed_ns: int
 
     @classmethod
     @understood
     def of(cls, message: odometry_pb2.TrackUpdate) -> TrackUpdate:
-        def pose(field: str) -> Array | None:
-            return pose_matrix(getattr(message, field)) if message.HasField(field) else None
-
-        def twist(field: str) -> Array | None:
-            return twist_vector(getattr(message, field)) if message.HasField(field) else None
-
+        keyframe, match, hypothesis = message.keyframe, message.match, message.hypothesis
         return cls(
             timestamp_ns=message.timestamp_ns,
-            sequence=message.sequence,
-            status=_word(odometry_pb2.TrackStatus, message.status, "TRACK_STATUS_"),
+            sequence_number=message.sequence_number,
+            status=enum_word(odometry_pb2.TrackStatus, message.status, "TRACK_STATUS_"),
             reason=message.reason or None,
-            room=_revision(message, "room"),
-            map_from_camera=pose("map_from_camera"),
-            map_from_camera_covariance=covariance_matrix(message.map_from_camera_covariance),
-            map_from_odom=pose("map_from_odom"),
-            odom_from_camera=pose("odom_from_camera"),
-            odom_from_camera_covariance=covariance_matrix(message.odom_from_camera_covariance),
-            map_from_base=pose("map_from_base"),
-            map_from_base_covariance=covariance_matrix(message.map_from_base_covariance),
-            odom_from_base=pose("odom_from_base"),
-            motion=twist_vector(message.motion),
-            motion_covariance=covariance_matrix(message.motion_covariance),
-            body_velocity=twist("body_velocity"),
-            base_velocity=twist("base_velocity"),
-            keyframe_sequence=message.keyframe_sequence,
-            is_keyframe=message.is_keyframe,
-            out_of_distribution=message.out_of_distribution,
-            best_match=Frame.of(message.best_match) if message.HasField("best_match") else None,
-            best_camera=message.best_camera or None,
-            match_used=message.match_used,
-            match_surprise=_known(message, "match_surprise"),
-            candidate=_candidate(message.candidate) if message.HasField("candidate") else None,
             contradicted=tuple(
-                _word(odometry_pb2.TrackSensor, sensor, "TRACK_SENSOR_") for sensor in message.contradicted
+                enum_word(odometry_pb2.TrackSensor, sensor, "TRACK_SENSOR_") for sensor in message.contradicted
             ),
-            elapsed_ns=message.elapsed_ns,
+            room=_revision(message, "room"),
+            camera=TrackedBody.of(message.camera),
+            base=TrackedBody.of(message.base) if message.HasField("base") else None,
+            map_from_odom=pose_matrix(message.map_from_odom) if message.HasField("map_from_odom") else None,
+            keyframe=KeyframeMotion(
+                twist_vector(keyframe.motion.twist),
+                covariance_matrix(keyframe.motion.covariance),
+                keyframe.sequence_number,
+                keyframe.is_new,
+            ),
+            match=TrackMatch(
+                _known(match, "novelty"),
+                Frame.of(match.frame) if match.HasField("frame") else None,
+                match.used,
+                _known(match, "mahalanobis_squared"),
+                match.camera or None,
+            ),
+            hypothesis=PoseHypothesis(
+                Revision.of(hypothesis.room),
+                pose_matrix(hypothesis.map_from_camera),
+                hypothesis.sequence_number,
+                hypothesis.agreed,
+                hypothesis.needed,
+            )
+            if message.HasField("hypothesis")
+            else None,
+            elapsed_ns=message.timing.elapsed_ns,
         )
-
-
-def _candidate(message: odometry_pb2.PlaceCandidate) -> Candidate:
-    return Candidate(
-        Revision.of(message.room),
-        pose_matrix(message.map_from_camera),
-        message.sequence,
-        message.agreed,
-        message.needed,
-    )
 
 
 @dataclass(frozen=True)
@@ -846,7 +1030,7 @@ class TrackRefusal:
     "superseded", "view", "pose", "odometry", "gravity" or "inertial"."""
 
     timestamp_ns: int
-    sequence: int
+    sequence_number: int
     reason: str
     message: str
     frames: int
@@ -854,70 +1038,167 @@ class TrackRefusal:
     @classmethod
     @understood
     def of(cls, message: odometry_pb2.TrackRefusal) -> TrackRefusal:
-        reason = _word(odometry_pb2.TrackRefusalReason, message.reason, "TRACK_REFUSAL_REASON_")
-        return cls(message.timestamp_ns, message.sequence, reason, message.message, message.frames)
+        reason = enum_word(odometry_pb2.TrackRefusalReason, message.reason, "TRACK_REFUSAL_REASON_")
+        return cls(message.timestamp_ns, message.sequence_number, reason, message.message, message.frames)
 
 
 @dataclass(frozen=True)
-class Rate:
-    """A share of the cases with its 95 % interval."""
+class Proportion:
+    """A share of the cases with its 95 % Wilson interval, each 0 to 1.
 
-    rate: float
+    Attributes:
+        value: The share.
+        low: The lower end of the interval.
+        high: The upper end of the interval.
+    """
+
+    value: float
     low: float
     high: float
 
     @classmethod
     @understood
-    def of(cls, message: evaluation_pb2.Rate) -> Rate:
-        return cls(message.rate, message.low, message.high)
+    def of(cls, message: evaluation_pb2.Proportion) -> Proportion:
+        return cls(message.value, message.low, message.high)
 
 
 @dataclass(frozen=True, eq=False)
 class NavigatorScores:
-    """The scores of one navigator over `n` questions. `hits` is Hit@ε by ε."""
+    """The scores of one navigator. Arrays have one entry for each threshold.
+
+    Attributes:
+        name: The name of the navigator.
+        n: The number of pairs scored.
+        latent_mse: The mean squared error of the predicted latents; None if only frames were predicted.
+        latent_r2: The variance-weighted R² of the predicted latents, not of motions; None if only frames were
+            predicted.
+        top1: The share of pairs for which the retrieved frame is the target itself.
+        thresholds: The thresholds ε, (k,), meters and radians mixed.
+        hits: Hit@ε, the share of pairs with an error below ε, (k,).
+        hits_low: The lower ends of the 95 % Wilson intervals of `hits`, (k,).
+        hits_high: The upper ends, (k,).
+        translation_m_median: The median distance between the retrieved and the target camera, meters.
+        rotation_rad_median: The median angle between them, radians.
+        recalls: The share of pairs within a distance (meters) and an angle (degrees), by both.
+        leaks: Whether these are no held-out scores; False for baselines and predicted frames.
+    """
 
     name: str
     n: int
-    mse: float | None
-    r2: float | None
-    top1: Rate
-    hits: dict[float, Rate]
+    latent_mse: float | None
+    latent_r2: float | None
+    top1: Proportion
+    thresholds: Array
+    hits: Array
+    hits_low: Array
+    hits_high: Array
     translation_m_median: float
     rotation_rad_median: float
-    recalls: dict[tuple[float, float], Rate]
+    recalls: dict[tuple[float, float], Proportion]
+    leaks: bool
 
     @classmethod
     @understood
     def of(cls, message: evaluation_pb2.NavigatorScores) -> NavigatorScores:
+        hits = [Proportion.of(hit.proportion) for hit in message.hit_rates]
         return cls(
             message.name,
             message.n,
-            _known(message, "mse"),
-            _known(message, "r2"),
-            Rate.of(message.top1),
-            {hit.threshold: Rate.of(hit.rate) for hit in message.hit_rates},
+            _known(message, "latent_mse"),
+            _known(message, "latent_r2"),
+            Proportion.of(message.top1),
+            np.array([hit.threshold for hit in message.hit_rates]),
+            np.array([hit.value for hit in hits]),
+            np.array([hit.low for hit in hits]),
+            np.array([hit.high for hit in hits]),
             message.translation_m_median,
             message.rotation_rad_median,
-            {(recall.translation_m, recall.rotation_deg): Rate.of(recall.rate) for recall in message.recalls},
+            {(one.translation_m, one.rotation_deg): Proportion.of(one.proportion) for one in message.recalls},
+            message.leaks,
+        )
+
+    def hit(self, threshold: float) -> Proportion:
+        """Hit@ε for one of the thresholds, found to nine digits.
+
+        Raises:
+            KeyError: no such threshold was scored.
+        """
+        for row, known in enumerate(self.thresholds):
+            if abs(known - threshold) <= 1e-9 * max(1.0, abs(threshold)):
+                return Proportion(float(self.hits[row]), float(self.hits_low[row]), float(self.hits_high[row]))
+        raise KeyError(f"{threshold} is none of the thresholds {', '.join(f'{known:g}' for known in self.thresholds)}")
+
+
+@dataclass(frozen=True, eq=False)
+class SplitPairs:
+    """The pairs of a split, and the frames that may be retrieved. A pair is (source, target), both rows of the room.
+
+    Attributes:
+        room: The room.
+        split: The split.
+        stride: The number of frames from source to target.
+        test: The test pairs, (n, 2).
+        train: The training pairs of this stride, (m, 2).
+        candidates: The frames that may be retrieved in a test, (c,).
+    """
+
+    room: Revision
+    split: str
+    stride: int
+    test: npt.NDArray[np.int64]
+    train: npt.NDArray[np.int64]
+    candidates: npt.NDArray[np.int64]
+
+    @classmethod
+    @understood
+    def of(cls, message: evaluation_pb2.ListPairsResponse) -> SplitPairs:
+        def pairs(sources: Sequence[int], targets: Sequence[int]) -> npt.NDArray[np.int64]:
+            return np.stack([np.array(sources, dtype=np.int64), np.array(targets, dtype=np.int64)], axis=1)
+
+        return cls(
+            Revision.of(message.room),
+            enum_word(geometry_pb2.Split, message.split, "SPLIT_"),
+            message.stride,
+            pairs(message.test_sources, message.test_targets),
+            pairs(message.training_sources, message.training_targets),
+            np.array(message.candidates, dtype=np.int64),
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Scores of navigators on a room's held-out pairs. If it `leaks`, the adapter has seen frames of these pairs."""
+    """Scores of navigators on pairs of frames of a room.
+
+    Attributes:
+        room: The room.
+        adapter: The adapter.
+        split: The split; None for pairs of no split.
+        stride: The number of frames from source to target; None if it is not the same for all pairs.
+        n: The number of pairs.
+        candidate_count: The number of frames that may be retrieved.
+        source_excluded: Whether the source frame of a pair could not be retrieved.
+        in_room: Whether the adapter was trained in this room; None for `score`.
+        leaks: Whether the adapter may have been trained on these pairs or their frames: the scores are then not
+            held-out scores.
+        calibrated_here: Whether the room is one of the adapter's calibration rooms: the scores of "+calibrated"
+            navigators are then not held-out scores.
+        steps: The number of steps of each motion; None for `score`.
+        step_mode: How the steps were chained; None for `score`.
+        navigators: The scores, one entry for each navigator.
+    """
 
     room: Revision
     adapter: Revision
-    split: str
-    stride: int
+    split: str | None
+    stride: int | None
     n: int
     candidate_count: int
     source_excluded: bool
-    in_room: bool
+    in_room: bool | None
     leaks: bool
     calibrated_here: bool
-    steps: int
-    mode: str
+    steps: int | None
+    step_mode: str | None
     navigators: tuple[NavigatorScores, ...]
 
     @classmethod
@@ -926,7 +1207,7 @@ class Evaluation:
         return cls(
             Revision.of(message.room),
             Revision.of(message.adapter),
-            message.split,
+            enum_word(geometry_pb2.Split, message.split, "SPLIT_"),
             message.stride,
             message.n,
             message.candidate_count,
@@ -935,15 +1216,68 @@ class Evaluation:
             message.leaks,
             message.calibrated_here,
             message.steps,
-            _word(navigation_pb2.Mode, message.mode, "MODE_"),
+            enum_word(navigation_pb2.StepMode, message.step_mode, "STEP_MODE_"),
             tuple(map(NavigatorScores.of, message.navigators)),
         )
 
-    def table(self) -> pandas.DataFrame:
-        """A row for each navigator: its scores, and Hit@ε with the ends of its 95 % interval. Needs pandas.
+    @classmethod
+    @understood
+    def of_scores(
+        cls,
+        message: evaluation_pb2.ScorePredictionsResponse,
+        request: evaluation_pb2.ScorePredictionsRequest,
+        name: str,
+    ) -> Evaluation:
+        strides = {one.target_frame_id - one.source_frame_id for one in request.predictions}
+        scores = NavigatorScores.of(message.scores)
+        return cls(
+            Revision.of(message.room),
+            Revision.of(message.adapter),
+            _word_or_none(geometry_pb2.Split, request.split, "SPLIT_"),
+            strides.pop() if len(strides) == 1 else None,
+            scores.n,
+            message.candidate_count,
+            request.exclude_source,
+            None,
+            message.leaks,
+            False,
+            None,
+            None,
+            (replace(scores, name=name),),
+        )
 
-        `n` questions; `r2` of predicted latents, not of motions; `median_m` and `median_deg` from the frame that was
-        retrieved to the one that was meant.
+    def with_navigator(self, other: Evaluation) -> Evaluation:
+        """This report with the rows of another one of the same pairs, for instance from `client.score`.
+
+        Args:
+            other: The report to add. Room, adapter, split, stride, number of pairs, candidates, exclusion of the
+                source and thresholds must be the same.
+
+        Raises:
+            ValueError: the reports are of different pairs, or a name of a navigator is in both.
+        """
+        for name in ("room", "adapter", "split", "stride", "n", "candidate_count", "source_excluded"):
+            ours, theirs = getattr(self, name), getattr(other, name)
+            if ours != theirs:
+                raise ValueError(f"the reports are of different pairs: {name} is {ours} and {theirs}")
+        thresholds = [scores.thresholds for scores in (*self.navigators, *other.navigators)]
+        if any(not np.array_equal(thresholds[0], one) for one in thresholds):
+            raise ValueError("the reports have different thresholds")
+        names = [scores.name for scores in (*self.navigators, *other.navigators)]
+        twice = [name for name in names if names.count(name) > 1]
+        if twice:
+            raise ValueError(f"{twice[0]!r} is in both reports; name it otherwise: score(…, name=…)")
+        return replace(self, navigators=self.navigators + other.navigators)
+
+    def table(self) -> pandas.DataFrame:
+        """The scores as a table, a row for each navigator. Needs the extra `seese3[pandas]`.
+
+        Columns are `n` pairs; `leak`, which is "LEAK" where the scores are not held-out scores, else ""; `latent_r2`,
+        the R² of predicted latents, not of motions; for each ε `hit@ε` with the ends of its 95 % interval; and
+        `median_m` and `median_deg`, the error of the retrieved frame.
+
+        Raises:
+            ImportError: pandas is not installed.
         """
         try:
             import pandas
@@ -952,19 +1286,28 @@ class Evaluation:
 
         rows = []
         for scores in self.navigators:
-            row: dict[str, Any] = {"navigator": scores.name, "n": scores.n, "r2": scores.r2}
-            for epsilon, hit in scores.hits.items():
-                row |= {
-                    f"hit@{epsilon:g}": hit.rate,
-                    f"hit@{epsilon:g} low": hit.low,
-                    f"hit@{epsilon:g} high": hit.high,
-                }
+            row: dict[str, Any] = {"navigator": scores.name, "n": scores.n}
+            row |= {"leak": "LEAK" if scores.leaks else "", "latent_r2": scores.latent_r2}
+            for epsilon, value, low, high in zip(
+                scores.thresholds, scores.hits, scores.hits_low, scores.hits_high, strict=True
+            ):
+                row |= {f"hit@{epsilon:g}": value, f"hit@{epsilon:g} low": low, f"hit@{epsilon:g} high": high}
             row |= {"median_m": scores.translation_m_median, "median_deg": np.degrees(scores.rotation_rad_median)}
             rows.append(row)
         return pandas.DataFrame(rows).set_index("navigator")
 
     def plot(self, axes: Any = None) -> Any:
-        """Draws Hit@ε over ε with 95 % intervals, a line for each navigator, and returns the axes. Needs matplotlib."""
+        """Draws Hit@ε over ε with 95 % intervals, a line for each navigator. Needs the extra `seese3[plots]`.
+
+        Args:
+            axes: The matplotlib axes to draw on; new ones if None.
+
+        Returns:
+            The axes.
+
+        Raises:
+            ImportError: matplotlib is not installed.
+        """
         try:
             from matplotlib import pyplot
         except ImportError as error:
@@ -972,24 +1315,17 @@ class Evaluation:
 
         axes = axes if axes is not None else pyplot.subplots(figsize=(9, 4.5), layout="constrained")[1]
         for number, scores in enumerate(self.navigators):
-            thresholds = list(scores.hits)
-            # There are ten colours: the next ten lines are dashed, so that no two are alike.
-            colour, dashes = f"C{number % 10}", ("-", "--", ":")[number // 10 % 3]
-            rates = [hit.rate for hit in scores.hits.values()]
-            axes.plot(thresholds, rates, dashes, color=colour, marker=".", label=scores.name)
-            axes.fill_between(
-                thresholds,
-                [hit.low for hit in scores.hits.values()],
-                [hit.high for hit in scores.hits.values()],
-                color=colour,
-                alpha=0.08,
-            )
+            # There are ten colors: the next ten lines are dashed, so that no two are alike.
+            color, dashes = f"C{number % 10}", ("-", "--", ":")[number // 10 % 3]
+            label = f"{scores.name} LEAK" if scores.leaks else scores.name
+            axes.plot(scores.thresholds, scores.hits, dashes, color=color, marker=".", label=label)
+            axes.fill_between(scores.thresholds, scores.hits_low, scores.hits_high, color=color, alpha=0.08)
+        motions = f"{self.n} motions" if self.stride is None else f"{self.n} motions over {self.stride} frames"
         axes.set(
-            xlabel="ε: metres and radians mixed",
+            xlabel="ε: meters and radians mixed",
             ylabel="Hit@ε",
             ylim=(0, 1.02),
-            title=f"{self.room.name}: {self.n} motions over {self.stride} frames, {self.split} split"
-            + (" (LEAKS)" if self.leaks else ""),
+            title=f"{self.room.name}: {motions}, {self.split or 'no'} split" + (" (LEAK)" if self.leaks else ""),
         )
         axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
         return axes

@@ -42,15 +42,16 @@ RETRIED = {
         "ListFrames",
         "ListAdapters",
         "GetAdapter",
+        "GetServerInfo",
         "SetDefault",
-        "RollBackDefault",
+        "ClearDefault",
         "DeleteRoom",
         "DeleteAdapter",
     ),
-    "NavigationService": ("Navigate", "BatchNavigate"),
+    "NavigationService": ("Navigate", "BatchNavigate", "PlanRoute"),
     "LocalizationService": ("Localize", "Relocalize"),
     "OdometryService": ("EstimateMotion", "Encode"),
-    "EvaluationService": ("ScorePredictions",),
+    "EvaluationService": ("ScorePredictions", "ListPairs"),
 }
 
 

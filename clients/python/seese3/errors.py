@@ -47,10 +47,8 @@ class RefusedError(SeeseError):
     """A call failed.
 
     - `code`: the gRPC code, for instance "INVALID_ARGUMENT".
-    - `reason`: the server's reason, for instance "INVALID_FIELD"; None if the call never reached the server, and of a
-      question of a batch.
-    - `field`: the path of the request field to change, for instance "view.feature"; None if there is none. The
-      question of a batch has it in its message.
+    - `reason`: the server's reason, for instance "INVALID_FIELD"; None if the call never reached the server.
+    - `field`: the path of the request field to change, for instance "view.feature"; None if there is none.
     - `retry_after_s`: how long the server asks to wait before the same call; None if it says nothing.
     - `request_id`: the id under which the server's log has the call; None if it is not known.
     """
@@ -82,6 +80,10 @@ class NotFoundError(RefusedError, LookupError):
     """A room, an adapter or a frame of this name is not there."""
 
 
+class ExistsError(RefusedError, ValueError):
+    """An upload would replace a room or an adapter with other content."""
+
+
 class PreconditionError(RefusedError):
     """The request is right, and what the server holds does not allow it."""
 
@@ -110,6 +112,7 @@ CLASSES: dict[grpc.StatusCode, type[RefusedError]] = {
     grpc.StatusCode.INVALID_ARGUMENT: InvalidFieldError,
     grpc.StatusCode.OUT_OF_RANGE: InvalidFieldError,
     grpc.StatusCode.NOT_FOUND: NotFoundError,
+    grpc.StatusCode.ALREADY_EXISTS: ExistsError,
     grpc.StatusCode.FAILED_PRECONDITION: PreconditionError,
     grpc.StatusCode.RESOURCE_EXHAUSTED: BusyError,
     grpc.StatusCode.ABORTED: ConflictError,
@@ -151,12 +154,12 @@ def printable(text: str) -> str:
     return "".join(character if character.isprintable() else " " for character in text)
 
 
-def refused_part(code: int, message: str) -> RefusedError:
-    """The exception of one request of a batch, whose gRPC code is a number."""
-    for status in grpc.StatusCode:
-        if status.value[0] == code:
-            return CLASSES.get(status, RefusedError)(message, code=status.name)
-    return RefusedError(message, code=str(code))
+def refused_part(status: status_pb2.Status) -> RefusedError:
+    """The exception of one request of a batch, with what the server said of it."""
+    for code in grpc.StatusCode:
+        if code.value[0] == status.code:
+            return CLASSES.get(code, RefusedError)(printable(status.message), code=code.name, **_details_of(status))
+    return RefusedError(printable(status.message), code=str(status.code), **_details_of(status))
 
 
 def _metadata(error: Any, key: str) -> bytes | str | None:
@@ -177,12 +180,15 @@ def _details(error: Any) -> dict[str, Any]:
     if not isinstance(packed, bytes):
         return {}
 
-    found: dict[str, Any] = {}
     try:
-        details = status_pb2.Status.FromString(packed).details
+        return _details_of(status_pb2.Status.FromString(packed))
     except DecodeError:
         return {}
-    for detail in details:
+
+
+def _details_of(status: status_pb2.Status) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for detail in status.details:
         for kind in (
             error_details_pb2.ErrorInfo,
             error_details_pb2.BadRequest,

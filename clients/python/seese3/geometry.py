@@ -1,7 +1,7 @@
 """Poses and motions as NumPy arrays.
 
-- A pose is a (4, 4) matrix `target_from_source`, metres; the camera's axes are x right, y down, z forward.
-- A twist is (6,), ordered (v, ω): metres and radians, in the body frame of the source camera.
+- A pose is a (4, 4) matrix `target_from_source`, meters; the camera's axes are x right, y down, z forward.
+- A twist is (6,), ordered (v, ω): meters and radians, in the body frame of the source camera.
 - A covariance of a pose is (6, 6) in ROS's order: x, y, z and rotations about x, y, z of the room's world frame.
 """
 
@@ -113,3 +113,84 @@ def wire_vector(vector: npt.ArrayLike) -> pb.Vector3:
 def covariance_matrix(values: Any) -> Array | None:
     """The (6, 6) matrix of 36 numbers; None if the server sent none."""
     return np.array(values).reshape(6, 6) if values else None
+
+
+def exp_se3(twist: npt.ArrayLike) -> Array:
+    """The pose of a motion: the exponential of a twist.
+
+    Args:
+        twist: (6,) or (n, 6), ordered (v, ω), meters and radians.
+
+    Returns:
+        `first_from_second`, (4, 4) or (n, 4, 4).
+
+    Raises:
+        ValueError: The array has another shape.
+
+    Example:
+        >>> world_from_second = world_from_first @ exp_se3(motion)
+    """
+    xi = real(twist, "a twist")
+    if xi.shape[-1:] != (6,) or xi.ndim > 2:
+        raise ValueError(f"a twist is (6,) or (n, 6), not {xi.shape}")
+    rows = np.atleast_2d(xi)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    for pose, row in zip(poses, rows, strict=True):
+        hat = _hat(row[3:])
+        a, b, c = _coefficients(float(np.linalg.norm(row[3:])))
+        pose[:3, :3] += a * hat + b * hat @ hat
+        pose[:3, 3] = row[:3] + b * hat @ row[:3] + c * hat @ hat @ row[:3]
+    return poses if xi.ndim == 2 else poses[0]
+
+
+def log_se3(pose: npt.ArrayLike) -> Array:
+    """The motion of a pose: the logarithm of `first_from_second`.
+
+    Args:
+        pose: (4, 4) or (n, 4, 4): rotations of less than 180 degrees and translations, meters.
+
+    Returns:
+        The twist (6,) or (n, 6), ordered (v, ω), meters and radians.
+
+    Raises:
+        ValueError: The array has another shape, or a matrix is no pose.
+
+    Example:
+        >>> motion = log_se3(np.linalg.inv(poses[0]) @ poses[1])
+    """
+    matrices = real(pose, "a pose")
+    if matrices.shape[-2:] != (4, 4) or matrices.ndim > 3:
+        raise ValueError(f"a pose is (4, 4) or (n, 4, 4), not {matrices.shape}")
+    rows = matrices.reshape(-1, 4, 4)
+    twists = np.zeros((len(rows), 6))
+    for twist, matrix in zip(twists, rows, strict=True):
+        orientation = wire_pose(matrix).orientation
+        axis = np.array([orientation.x, orientation.y, orientation.z])
+        sine = float(np.linalg.norm(axis))
+        angle = 2 * math.atan2(sine, orientation.w)
+        omega = axis * (angle / sine if sine > 1e-12 else 2.0)
+        a, b, _ = _coefficients(angle)
+        # The inverse of V(ω); its last coefficient tends to 1/12.
+        last = (1 - a / (2 * b)) / angle**2 if angle > 1e-4 else 1 / 12
+        hat = _hat(omega)
+        t = matrix[:3, 3]
+        twist[:3] = t - hat @ t / 2 + last * hat @ hat @ t
+        twist[3:] = omega
+    return twists if matrices.ndim == 3 else twists[0]
+
+
+def _hat(omega: Array) -> Array:
+    x, y, z = omega
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def _coefficients(angle: float) -> tuple[float, float, float]:
+    """sin θ / θ, (1 − cos θ) / θ² and (θ − sin θ) / θ³, by series near 0."""
+    square = angle * angle
+    if angle < 1e-2:
+        return (
+            1 - square / 6 + square**2 / 120,
+            0.5 - square / 24 + square**2 / 720,
+            1 / 6 - square / 120 + square**2 / 5_040,
+        )
+    return math.sin(angle) / angle, (1 - math.cos(angle)) / square, (angle - math.sin(angle)) / (square * angle)

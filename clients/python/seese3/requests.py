@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import struct
+import os
 import uuid
-import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -16,23 +15,14 @@ import numpy.typing as npt
 
 from .answers import Camera, FeatureSource
 from .geometry import real, wire_pose, wire_twist, wire_vector
-from .v1 import catalog_pb2, geometry_pb2, navigation_pb2, odometry_pb2
-from .views import View, wire_view
+from .v1 import catalog_pb2, evaluation_pb2, geometry_pb2, navigation_pb2, odometry_pb2
+from .views import Latent, View, png, wire_view
+from .words import Fusion, InverseVariant, StepMode, enum_value
 
 # The approximate size of one message of an upload, bytes.
 UPLOAD_BYTES = 1 << 20
 
-Bytes: TypeAlias = "bytes | Path"
-
-
-def enum_value(enum: Any, prefix: str, word: str | None, argument: str) -> int:
-    """The value of an enum by its word: "snap" is MODE_SNAP; None is the server's default."""
-    if word is None:
-        return 0
-    words: dict[str, int] = {name.removeprefix(prefix).lower(): number for name, number in enum.items() if number != 0}
-    if word not in words:
-        raise ValueError(f"{argument}: {word!r} is none of {', '.join(words)}")
-    return words[word]
+Bytes: TypeAlias = "bytes | str | os.PathLike[str]"
 
 
 def count(number: int | None, argument: str) -> Any:
@@ -49,21 +39,26 @@ def names(given: Sequence[str] | str) -> Sequence[str]:
 
 def wire_views(views: Sequence[View]) -> list[geometry_pb2.View]:
     """Views on the wire. One view alone is refused: the bytes of an image are a sequence too, of numbers."""
-    if isinstance(views, (bytes, str, Path)):
+    if isinstance(views, (bytes, str, os.PathLike)):
         raise TypeError(f"views: is a sequence of views, not {type(views).__name__}; put one into a list")
     return [wire_view(view) for view in views]
 
 
-def mode(word: str | None) -> Any:
-    return enum_value(navigation_pb2.Mode, "MODE_", word, "mode")
+def step_mode(word: str | None) -> Any:
+    return enum_value(navigation_pb2.StepMode, "STEP_MODE_", word, "step_mode")
+
+
+def split_value(word: str | None) -> Any:
+    """The value of a split; "fold1" and "fold_1" are the same."""
+    if isinstance(word, str) and word.startswith("fold") and word[4:].isdigit():
+        word = f"fold_{word[4:]}"
+    return enum_value(geometry_pb2.Split, "SPLIT_", word, "split")
 
 
 def wire_camera(camera: Camera | None) -> geometry_pb2.CameraIntrinsics | None:
     if camera is None:
         return None
-    model: Any = enum_value(
-        geometry_pb2.DistortionModel, "DISTORTION_MODEL_", camera.distortion_model, "distortion_model"
-    )
+    model = enum_value(geometry_pb2.DistortionModel, "DISTORTION_MODEL_", camera.distortion_model, "distortion_model")
     return geometry_pb2.CameraIntrinsics(
         width=camera.width,
         height=camera.height,
@@ -108,7 +103,7 @@ def displacement(
 
 
 @dataclass(frozen=True, eq=False)
-class Question:
+class NavigationQuery:
     """One navigation: from a view, by a motion. See `Client.navigate` for what the arguments mean."""
 
     source: View
@@ -117,29 +112,33 @@ class Question:
     pose: npt.ArrayLike | None = None
     source_pose: npt.ArrayLike | None = None
     steps: int | None = None
-    mode: str | None = None
-    reading: str | None = None
-    navigator: str = ""
+    step_mode: StepMode | None = None
+    inverse_variant: InverseVariant | None = None
+    navigator: str | None = None
     top_k: int | None = None
     exclude_source: bool = False
     exclude_radius: int = 0
-    thresholds: Sequence[float] = ()
 
-    def request(self, room: str, adapter: str) -> navigation_pb2.NavigateRequest:
+    def request(
+        self, room: str, adapter: str | None, room_revision: int | None = None, adapter_revision: int | None = None
+    ) -> navigation_pb2.NavigateRequest:
         return navigation_pb2.NavigateRequest(
             room=room,
+            room_revision=room_revision,
             adapter=adapter,
+            adapter_revision=adapter_revision,
             source=wire_view(self.source),
             source_pose=None if self.source_pose is None else wire_pose(self.source_pose),
             displacement=displacement(self.to, self.twist, self.pose),
             steps=count(self.steps, "steps"),
-            mode=mode(self.mode),
-            reading=enum_value(navigation_pb2.Reading, "READING_", self.reading, "reading"),  # type: ignore[arg-type]
+            step_mode=step_mode(self.step_mode),
+            inverse_variant=enum_value(
+                navigation_pb2.InverseVariant, "INVERSE_VARIANT_", self.inverse_variant, "inverse_variant"
+            ),
             navigator=self.navigator,
             top_k=count(self.top_k, "top_k"),
             exclude_source=self.exclude_source,
             exclude_radius=count(self.exclude_radius, "exclude_radius"),
-            thresholds=self.thresholds,
         )
 
 
@@ -228,13 +227,15 @@ class InertialSamples:
 class TrackConfig:
     """What a tracking stream is to do. What is left out is chosen by the server."""
 
-    room: str = ""
+    room: str | None = None
     rooms: Sequence[str] | str = ()
-    adapter: str = ""
+    room_revisions: Mapping[str, int] | None = None
+    adapter: str | None = None
+    adapter_revision: int | None = None
     initial_pose: InitialPose | None = None
     keyframe_displacement: float | None = None
     keyframe_frames: int | None = None
-    fusion: str | None = None
+    fusion: Fusion | None = None
     """"anchors" (the default): located views correct the pose; or "none"."""
     newest_only: bool = False
     """Whether frames that arrive faster than they can be answered are dropped for newer ones."""
@@ -274,10 +275,12 @@ class TrackConfig:
         return odometry_pb2.TrackConfig(
             room=self.room,
             rooms=names(self.rooms),
+            room_revisions=self.room_revisions,
             adapter=self.adapter,
+            adapter_revision=self.adapter_revision,
             initial_pose=self.initial_pose.message() if self.initial_pose else None,
             keyframes=keyframes,
-            fusion=enum_value(odometry_pb2.Fusion, "FUSION_", self.fusion, "fusion"),  # type: ignore[arg-type]
+            fusion=enum_value(odometry_pb2.Fusion, "FUSION_", self.fusion, "fusion"),
             back_pressure=pressure,
             token_every=self.token_every,
             base_from_camera=None if self.base_from_camera is None else wire_pose(self.base_from_camera),
@@ -333,29 +336,13 @@ class DepthImage:
             raise ValueError(f"depth.depths: is {depths.shape}, not (height, width)")
         millimeters = np.nan_to_num(np.round(depths * 1000), nan=0, posinf=0, neginf=0)
         millimeters[(millimeters < 0) | (millimeters > np.iinfo(np.uint16).max)] = 0
-        return odometry_pb2.DepthImage(png=gray16_png(millimeters.astype(np.uint16)), deviation_m=self.deviation_m)
-
-
-def gray16_png(values: npt.NDArray[np.uint16]) -> bytes:
-    """A PNG of 16-bit gray values (h, w)."""
-    height, width = values.shape
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        check = zlib.crc32(kind + data)
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", check)
-
-    # Each row begins with the number of its filter, 0 for none.
-    rows = np.zeros((height, 1 + 2 * width), np.uint8)
-    rows[:, 1:] = values.astype(">u2").view(np.uint8).reshape(height, 2 * width)
-    header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
-    pixels = zlib.compress(rows.tobytes(), 1)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+        return odometry_pb2.DepthImage(png=png(millimeters.astype(np.uint16)), deviation_m=self.deviation_m)
 
 
 def track_frame(
     view: View,
     timestamp_ns: int,
-    sequence: int,
+    sequence_number: int,
     odometry: Odometry | None,
     gravity: Gravity | None,
     other_views: dict[str, View],
@@ -385,7 +372,7 @@ def track_frame(
     return odometry_pb2.TrackRequest(
         frame=odometry_pb2.TrackFrame(
             timestamp_ns=timestamp_ns,
-            sequence=sequence,
+            sequence_number=sequence_number,
             view=wire_view(view),
             odometry=measured,
             gravity=down,
@@ -403,13 +390,61 @@ class Prediction:
 
     source: int
     target: int
-    latent: npt.ArrayLike | None = None
+    latent: npt.ArrayLike | Latent | None = None
     frame: int | None = None
     last_step_frame: int | None = None
 
     def __post_init__(self) -> None:
         if (self.latent is None) == (self.frame is None):
             raise ValueError("a prediction is exactly one of latent and frame")
+
+    def message(self) -> evaluation_pb2.Prediction:
+        latent = self.latent
+        if latent is not None and not isinstance(latent, Latent):
+            latent = Latent(real(latent, "latent"))
+        return evaluation_pb2.Prediction(
+            source_frame_id=count(self.source, "source"),
+            target_frame_id=count(self.target, "target"),
+            latent=None if latent is None else latent.message(),
+            retrieved_frame_id=count(self.frame, "frame"),
+            last_step_frame_id=count(self.last_step_frame, "last_step_frame"),
+        )
+
+
+def predictions(
+    given: Sequence[Prediction] | None,
+    sources: npt.ArrayLike | None,
+    targets: npt.ArrayLike | None,
+    latents: npt.ArrayLike | None,
+    frames: npt.ArrayLike | None,
+) -> list[evaluation_pb2.Prediction]:
+    """Predictions on the wire, from objects or from arrays."""
+    arrays = (sources, targets, latents, frames)
+    if given is not None:
+        if any(array is not None for array in arrays):
+            raise ValueError("give predictions, or sources and targets with latents or frames; not both")
+        return [one.message() for one in given]
+    if sources is None or targets is None or (latents is None) == (frames is None):
+        raise ValueError("give predictions, or sources, targets and exactly one of latents and frames")
+
+    ends = [_rows(sources, "sources"), _rows(targets, "targets")]
+    found = _rows(frames, "frames") if frames is not None else real(latents, "latents")  # type: ignore[arg-type]
+    if latents is not None and found.ndim != 2:
+        raise ValueError(f"latents: are (n, k), not {found.shape}")
+    if not len(ends[0]) == len(ends[1]) == len(found):
+        lengths = f"{len(ends[0])}, {len(ends[1])} and {len(found)}"
+        raise ValueError(f"sources, targets and predictions have different lengths: {lengths}")
+    rows = zip(*ends, found, strict=True)
+    if latents is not None:
+        return [Prediction(int(source), int(target), latent=one).message() for source, target, one in rows]
+    return [Prediction(int(source), int(target), frame=int(one)).message() for source, target, one in rows]
+
+
+def _rows(values: npt.ArrayLike, argument: str) -> npt.NDArray[np.int64]:
+    rows = np.asarray(values)
+    if rows.ndim != 1 or not (np.issubdtype(rows.dtype, np.integer) or rows.size == 0):
+        raise ValueError(f"{argument}: are whole numbers (n,), not {rows.dtype} of shape {rows.shape}")
+    return rows.astype(np.int64)
 
 
 def integers(values: Any, argument: str, within: range) -> None:
@@ -429,7 +464,12 @@ def new_id() -> str:
 
 
 def feature_source(source: FeatureSource) -> catalog_pb2.FeatureSource:
-    return catalog_pb2.FeatureSource(**{name: getattr(source, name) for name in FeatureSource.__dataclass_fields__})
+    """A feature source on the wire."""
+    words = ("layer_index_base", "final_norm")
+    plain = {name: getattr(source, name) for name in FeatureSource.__dataclass_fields__ if name not in words}
+    base = enum_value(catalog_pb2.LayerIndexBase, "LAYER_INDEX_BASE_", source.layer_index_base, "layer_index_base")
+    norm = enum_value(catalog_pb2.FinalNorm, "FINAL_NORM_", source.final_norm, "final_norm")
+    return catalog_pb2.FeatureSource(layer_index_base=base, final_norm=norm, **plain)
 
 
 @dataclass(frozen=True, eq=False)
@@ -441,26 +481,26 @@ class Upload:
     images: Sequence[Bytes] = ()
     timestamps_ns: Sequence[int] | npt.NDArray[np.int64] | None = None
     names: Sequence[str] = ()
-    sequences: Sequence[int] | npt.NDArray[np.integer] | None = None
+    segments: Sequence[int] | npt.NDArray[np.integer] | None = None
 
     def __post_init__(self) -> None:
         poses = real(self.poses, "poses").astype("<f8")
         if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) == 0:
             raise ValueError(f"poses: are (n, 4, 4) with at least one frame, not {poses.shape}")
         counts = {"images": self.images, "names": self.names}
-        counts |= {"timestamps_ns": self.timestamps_ns, "sequences": self.sequences}  # type: ignore[dict-item]
+        counts |= {"timestamps_ns": self.timestamps_ns, "segments": self.segments}  # type: ignore[dict-item]
         for argument, values in counts.items():
             if values is not None and len(values) not in (0, len(poses)):
                 raise ValueError(f"{argument}: has {len(values)} entries, there are {len(poses)} poses")
         integers(self.timestamps_ns, "timestamps_ns", range(-(1 << 63), 1 << 63))
-        integers(self.sequences, "sequences", range(1 << 32))
+        integers(self.segments, "segments", range(1 << 32))
         for row, name in enumerate(self.names):
             if not isinstance(name, str):
                 raise ValueError(f"names: row {row} is {name!r}, and no text")
         for row, image in enumerate(self.images):
-            if not isinstance(image, (bytes, Path)):
-                raise ValueError(f"images: row {row} is {image!r}, and neither bytes nor a pathlib.Path")
-            if isinstance(image, Path) and not image.is_file():
+            if not isinstance(image, (bytes, str, os.PathLike)):
+                raise ValueError(f"images: row {row} is {image!r}, and neither bytes nor a path")
+            if not isinstance(image, bytes) and not Path(image).is_file():
                 raise ValueError(f"images: row {row}, {image}, is no file")
         for source, rows in self.features:
             if np.asarray(rows).shape != (len(poses), source.dim):
@@ -468,19 +508,19 @@ class Upload:
                 raise ValueError(f"features: {source.name!r} is ({len(poses)}, {source.dim}), not {shape}")
         object.__setattr__(self, "poses", poses)
 
-    def messages(self, room: catalog_pb2.RoomUpload) -> Iterator[catalog_pb2.CreateRoomRequest]:
+    def messages(self, room: catalog_pb2.RoomUpload) -> Iterator[catalog_pb2.UploadRoomRequest]:
         """The messages of the upload, the description first and the checksum last."""
-        yield catalog_pb2.CreateRoomRequest(room=room)
+        yield catalog_pb2.UploadRoomRequest(room=room)
         digest = hashlib.sha256()
         poses = np.asarray(self.poses)
         for rows in self._batches():
             batch = self._batch(slice(rows.start, rows.stop))
             for content in (batch.poses, *batch.features, *batch.images):
                 digest.update(content)
-            yield catalog_pb2.CreateRoomRequest(frames=batch)
+            yield catalog_pb2.UploadRoomRequest(frames=batch)
 
         end = catalog_pb2.UploadEnd(frame_count=len(poses), sha256=digest.digest())
-        yield catalog_pb2.CreateRoomRequest(end=end)
+        yield catalog_pb2.UploadRoomRequest(end=end)
 
     def _batches(self) -> Iterator[range]:
         count = len(np.asarray(self.poses))
@@ -497,8 +537,8 @@ class Upload:
         return catalog_pb2.FrameBatch(
             poses=poses.tobytes(),
             features=[np.asarray(values)[rows].astype("<f4").tobytes() for _, values in self.features],
-            images=[image if isinstance(image, bytes) else image.read_bytes() for image in self.images[rows]],
+            images=[image if isinstance(image, bytes) else Path(image).read_bytes() for image in self.images[rows]],
             timestamps_ns=[] if self.timestamps_ns is None else [int(time) for time in self.timestamps_ns[rows]],
             frame_names=self.names[rows],
-            sequences=[] if self.sequences is None else [int(number) for number in self.sequences[rows]],
+            segments=[] if self.segments is None else [int(number) for number in self.segments[rows]],
         )

@@ -30,9 +30,11 @@ import numpy.typing as npt
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from .answers import Camera, FeatureSource, Revision
+from .answers import Camera, FeatureSource
 from .errors import DamagedError, SeeseError
 from .geometry import Array, real
+from .views import Revision
+from .words import FinalNorm, LayerIndexBase
 
 SCHEMA = 1
 # Rotations that are further from SO(3) are taken for a mistake, as by `seese3 import`.
@@ -50,6 +52,9 @@ POSITION_STEPS = 65535
 MOST_INVERSE_DEPTH = 16.0
 DEVIATION_STEPS = 1000
 COMPRESSED = 32
+# Words of manifests for where layers are numbered from, and for a final normalization.
+BASES: dict[Any, LayerIndexBase] = {"0": "zero", "1": "one", "name": "name"}
+NORMS: dict[Any, FinalNorm] = {"none": "none", "final": "applied"}
 NUMBER = re.compile("[0-9]{1,18}")
 PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
@@ -287,7 +292,7 @@ class Store:
         for source, rows in new.features:
             content = _safetensors({"features": rows})
             stored_as = self._write("rooms", name, f"features-{source.name}", "safetensors", content)
-            entries[source.name] = {"source": asdict(source), "object": stored_as}
+            entries[source.name] = {"source": _stored_source(source), "object": stored_as}
         for entry in newest["features"] if newest else []:
             entries.setdefault(entry["source"]["name"], entry)
 
@@ -411,7 +416,7 @@ class Store:
             "adapter": name,
             "revision": 0,
             "created": "",
-            "source": asdict(source),
+            "source": _stored_source(source),
             "weights": self._write("adapters", name, "weights", "safetensors", _safetensors(content)),
             "twist_frame": "body",
             "deviation_ddof": 0,
@@ -619,7 +624,20 @@ def _read_manifest(path: Path) -> dict[str, Any]:
 
 
 def _source(entry: dict[str, Any]) -> FeatureSource:
-    return FeatureSource(**{key: entry[key] for key in FeatureSource.__dataclass_fields__ if key in entry})
+    plain = {key: entry[key] for key in FeatureSource.__dataclass_fields__ if key in entry}
+    return FeatureSource(
+        **plain, layer_index_base=BASES.get(entry.get("base")), final_norm=NORMS.get(entry.get("norm"))
+    )
+
+
+def _stored_source(source: FeatureSource) -> dict[str, Any]:
+    """A source as a manifest has it."""
+    entry = asdict(source)
+    stored_base = {word: stored for stored, word in BASES.items()}
+    stored_norm = {word: stored for stored, word in NORMS.items()}
+    entry["base"] = stored_base.get(entry.pop("layer_index_base"), "unspecified")
+    entry["norm"] = stored_norm.get(entry.pop("final_norm"), "unspecified")
+    return entry
 
 
 def _are_valid_for(keypoints: dict[str, Any] | None, body: dict[str, Any]) -> bool:
@@ -769,7 +787,7 @@ def _checked_features(
 def _checked_source(source: FeatureSource) -> FeatureSource:
     texts = {key: value for key, value in asdict(source).items() if key != "dim"}
     for key, value in texts.items():
-        if not isinstance(value, str):
+        if not isinstance(value, str) and not (value is None and key in ("layer_index_base", "final_norm")):
             raise ValueError(f"features: {key} of the source {source.name!r} is {value!r}, and no text")
     if not isinstance(source.dim, (int, np.integer)) or source.dim < 1:
         raise ValueError(f"features: the source {source.name!r} has {source.dim!r} columns")

@@ -3,21 +3,26 @@
 A view is one of these:
 
 - an `int`: the row of a stored frame of the room;
-- a NumPy array (d,): a feature of the encoder that the adapter was trained on;
+- a NumPy array (d,) of floating-point numbers: a feature of the encoder that the adapter was trained on;
 - a `Feature`: the same, with the name of its source, which the server then checks;
 - a `Latent`: an adapter's latent, from `encode` or an earlier answer;
-- `bytes` or a `pathlib.Path`: an image, as the content of a JPEG or PNG file or its path.
+- an image: `bytes`, the content of a JPEG or PNG file; `str` or `os.PathLike`, its path; or a NumPy array of bytes
+  (uint8), (h, w, 3) in the order red, green, blue, or (h, w) gray.
 """
 
 from __future__ import annotations
 
+import os
+import struct
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from .errors import understood
 from .v1 import geometry_pb2 as pb
 
 
@@ -30,13 +35,41 @@ class Feature:
 
 
 @dataclass(frozen=True)
+class Revision:
+    """A published version of a room or an adapter, which never changes.
+
+    Attributes:
+        name: The name of the room or adapter.
+        revision: The number of the version, counted from 1.
+    """
+
+    name: str
+    revision: int
+
+    @classmethod
+    @understood
+    def of(cls, message: pb.Revision) -> Revision:
+        return cls(message.name, message.revision)
+
+
+@dataclass(frozen=True)
 class Latent:
-    """A latent (k,) of an adapter."""
+    """A latent of an adapter.
+
+    Attributes:
+        values: The coordinates, (k,).
+        adapter: The adapter that made it, as `encode` states it. A request that names no adapter uses this one.
+    """
 
     values: npt.NDArray[np.float64]
+    adapter: Revision | None = None
+
+    def message(self) -> pb.Latent:
+        of = None if self.adapter is None else pb.Revision(name=self.adapter.name, revision=self.adapter.revision)
+        return pb.Latent(values=_row(self.values, "a latent").tolist(), adapter=of)
 
 
-View: TypeAlias = "int | np.integer | npt.NDArray[np.floating] | Feature | Latent | bytes | Path"
+View: TypeAlias = "int | np.integer | npt.NDArray[Any] | Feature | Latent | bytes | str | os.PathLike[str]"
 
 
 def wire_view(view: View) -> pb.View:
@@ -49,19 +82,21 @@ def wire_view(view: View) -> pb.View:
         return pb.View(frame_id=int(view))
     if isinstance(view, bytes):
         return pb.View(image=view)
-    if isinstance(view, Path):
-        return pb.View(image=view.read_bytes())
+    if isinstance(view, (str, os.PathLike)):
+        return pb.View(image=Path(view).read_bytes())
     if isinstance(view, Latent):
-        return pb.View(latent=pb.Latent(values=_row(view.values, "a latent").tolist()))
+        return pb.View(latent=view.message())
     if isinstance(view, Feature):
         return _packed_feature(view.values, view.source_name)
+    if isinstance(view, np.ndarray) and view.dtype == np.uint8 and view.ndim in (2, 3):
+        return pb.View(image=png(view))
     if isinstance(view, np.ndarray):
         return _packed_feature(view, "")
 
     kind = type(view).__name__
     raise TypeError(
-        f"a view is a frame's row (int), a feature (a NumPy array), a Latent, an image (bytes) or its path "
-        f"(pathlib.Path), not {kind}"
+        f"a view is a frame's row (int), a feature (a NumPy array), a Latent, or an image: bytes, a path, or a NumPy "
+        f"array of bytes; not {kind}"
     )
 
 
@@ -91,3 +126,30 @@ def _varint(number: int) -> bytes:
         number >>= 7
     octets.append(number)
     return bytes(octets)
+
+
+def png(pixels: npt.NDArray[Any]) -> bytes:
+    """A PNG of gray values (h, w) of 8 or 16 bits, or of colors (h, w, 3) of 8 bits.
+
+    Raises:
+        ValueError: the array has another shape or type.
+    """
+    is_color = pixels.ndim == 3 and pixels.shape[2] == 3 and pixels.dtype == np.uint8
+    is_gray = pixels.ndim == 2 and pixels.dtype in (np.uint8, np.uint16)
+    if not (is_color or is_gray) or 0 in pixels.shape:
+        raise ValueError(f"an image is (h, w) or (h, w, 3) of uint8, not {pixels.dtype} of shape {pixels.shape}")
+
+    height, width = pixels.shape[:2]
+    bits = 8 * pixels.dtype.itemsize
+    lines = np.ascontiguousarray(pixels.astype(f">u{pixels.dtype.itemsize}")).view(np.uint8).reshape(height, -1)
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        check = zlib.crc32(kind + data)
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", check)
+
+    # Each row begins with the number of its filter, 0 for none.
+    rows = np.zeros((height, 1 + lines.shape[1]), np.uint8)
+    rows[:, 1:] = lines
+    header = struct.pack(">IIBBBBB", width, height, bits, 2 if is_color else 0, 0, 0, 0)
+    compressed = zlib.compress(rows.tobytes(), 1)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", compressed) + chunk(b"IEND", b"")

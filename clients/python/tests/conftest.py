@@ -15,9 +15,9 @@ FEATURES = "pixels"
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The store as it was made. Tests that change one take a copy."""
     store = tmp_path_factory.mktemp("drawn") / "store"
-    seese3.run("studio", "--rooms", "3", "--frames", "120", "--out", store, "--keep-images")
+    seese3.run("studio", "--rooms", "3", "--frames", "120", "--store", store, "--keep-images")
     for room in ROOMS:
-        seese3.run("encode", "--store", store, "--room", room, "--model", FEATURES)
+        seese3.run("encode", "--store", store, "--room", room, "--encoder", FEATURES)
     calibration = [word for room in ROOMS[1:] for word in ("--calibrate-on", room)]
     options = ["--preset", "steady", "--split", "whole", "--stride", "10", "--name", "robot", *calibration]
     seese3.run("train", "--store", store, "--room", ROOM, "--features", FEATURES, *options)

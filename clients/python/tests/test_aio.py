@@ -18,26 +18,26 @@ def test_both_clients_answer_alike(server: seese3.Server, client: seese3.Client,
             calls = [asynchronous.navigate(ROOM, row, to=row + 10) for row in range(20)]
             ends = [answer.frame.id for answer in await asyncio.gather(*calls)]
             names = [room.name for room in await asynchronous.rooms()]
-            way = await asynchronous.navigate_to(ROOM, 5, goal=60)
+            route = await asynchronous.plan_route(ROOM, 5, goal=60)
 
             async with asynchronous.track(seese3.TrackConfig(room=ROOM)) as track:
                 updates = [await track.step(feature, row * 33_000_000) for row, feature in enumerate(rows[:20])]
             statuses = [getattr(update, "status", None) for update in updates]
-            report = await asynchronous.evaluate(ROOM, stride=10)
+            report = await asynchronous.evaluate(ROOM, adapter="robot", stride=10)
 
             with pytest.raises(seese3.InvalidFieldError) as error:
                 await asynchronous.localize(np.zeros(3), rooms=ROOM)
             assert error.value.field == "view.feature.values"
-            return ends, names, len(way.steps), statuses, report
+            return ends, names, len(route.hops), statuses, report
 
     ends, names, steps, statuses, report = asyncio.run(ask())
     assert ends == [client.navigate(ROOM, row, to=row + 10).frame.id for row in range(20)]
     assert names == [room.name for room in client.rooms()]
-    assert steps == len(client.navigate_to(ROOM, 5, goal=60).steps)
+    assert steps == len(client.plan_route(ROOM, 5, goal=60).hops)
     with client.track(seese3.TrackConfig(room=ROOM)) as track:
         updates = [track.step(feature, row * 33_000_000) for row, feature in enumerate(rows[:20])]
     assert statuses == [getattr(update, "status", None) for update in updates]
-    assert report.table().equals(client.evaluate(ROOM, stride=10).table())
+    assert report.table().equals(client.evaluate(ROOM, adapter="robot", stride=10).table())
 
 
 def test_an_upload_is_sent_by_the_asynchronous_client_too(store: Path) -> None:
@@ -46,7 +46,7 @@ def test_an_upload_is_sent_by_the_asynchronous_client_too(store: Path) -> None:
 
     async def send(address: str) -> seese3.answers.Publication:
         async with seese3.AsyncClient(address) as client:
-            return await client.create_room("copy", upload)
+            return await client.upload_room("copy", upload)
 
     with seese3.serve(store, "--writable") as server:
         assert asyncio.run(send(server.address)).served
@@ -64,10 +64,10 @@ def test_a_step_that_is_given_up_did_not_happen(drawn: Path) -> None:
                     with pytest.raises(asyncio.TimeoutError):
                         await asyncio.wait_for(track.step(feature, row * 33_000_000), 0.2)
                     server._process.send_signal(signal.SIGCONT)
-                    assert track.last_sequence == given_up, "its number is not used up"
+                    assert track.last_sequence_number == given_up, "its number is not used up"
                 update = await track.step(feature, row * 33_000_000)
                 assert isinstance(update, seese3.TrackUpdate)
-                poses.append(update.map_from_camera)
+                poses.append(update.camera.map_pose)
             assert track.resumed == (given_up is not None)
         return poses
 

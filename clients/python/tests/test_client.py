@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import seese3
 from conftest import FEATURES, ROOM, ROOMS
-from seese3 import Question
+from seese3 import NavigationQuery
 from seese3.v1 import catalog_pb2, evaluation_pb2, localization_pb2, navigation_pb2, odometry_pb2
 
 
@@ -26,16 +26,32 @@ def test_every_call_of_the_protocol_has_a_method() -> None:
     assert missing == []
 
 
+def cv2_pixels(image: Path) -> np.ndarray:
+    """The pixels of an image in the order red, green, blue."""
+    import cv2
+
+    return np.ascontiguousarray(cv2.imread(str(image))[:, :, ::-1])
+
+
 def test_the_catalog(client: seese3.Client, drawn: Path) -> None:
     assert [room.name for room in client.rooms()] == list(ROOMS)
     room = client.room(ROOM)
     assert room.frame_count == 120 and room.adapters == ("robot",)
+    # Encoding published a second revision; the first has the features of the studio alone.
+    assert (room.name, room.revision) == (ROOM, 2)
+    assert client.room(ROOM, revision=1).revision == 1
+    with pytest.raises(seese3.NotFoundError):
+        client.room(ROOM, revision=9)
+
+    info = client.server_info()
+    assert info.version == seese3.__version__ and info.encodes_images and not info.writable
+    assert info.encoders[0].adapters == ("robot",) and info.limits["top_k"] >= 1
 
     stored = seese3.Store(drawn).room(ROOM)
-    frames = client.frames(ROOM, neighbours_within=0.2)
+    frames = client.frames(ROOM, neighbors_within=0.2)
     np.testing.assert_allclose(frames.poses, stored.poses, atol=1e-12)
-    assert frames.neighbours is not None
-    near, motion = frames.neighbours[60][0]
+    assert frames.neighbors is not None
+    near, motion = frames.neighbors[60][0]
     # The motion is log(P₁⁻¹P₂): of frames so near its translation is that of the relative pose, to a hundredth.
     relative = np.linalg.inv(stored.poses[60]) @ stored.poses[near]
     np.testing.assert_allclose(motion[:3], relative[:3, 3], atol=0.01)
@@ -46,34 +62,47 @@ def test_the_catalog(client: seese3.Client, drawn: Path) -> None:
 
 
 def test_navigation(client: seese3.Client) -> None:
-    answer = client.navigate(ROOM, 20, to=30, steps=2, mode="snap", thresholds=[0.25])
-    assert len(answer.steps) == 2 and answer.mode == "snap"
-    assert answer.steps[-1].error is not None and list(answer.steps[-1].error.within) == [0.25]
+    answer = client.navigate(ROOM, 20, to=30, steps=2, step_mode="snap")
+    assert len(answer.steps) == 2 and answer.step_mode == "snap" and answer.inverse_variant == "homogeneous"
+    assert answer.steps[-1].error is not None and answer.steps[-1].error.twist_norm > 0
 
     # The same motion as a twist leads to the same frame.
-    assert client.navigate(ROOM, 20, twist=answer.displacement, steps=2, mode="snap").frame.id == answer.frame.id
+    assert client.navigate(ROOM, 20, twist=answer.displacement, steps=2, step_mode="snap").frame.id == answer.frame.id
 
-    batch = client.navigate_batch(ROOM, [Question(20, to=30, steps=2, mode="snap"), Question(20, to=9999)])
+    queries = [NavigationQuery(20, to=30, steps=2, step_mode="snap"), NavigationQuery(20, to=9999)]
+    batch = client.navigate_batch(ROOM, queries)
     assert isinstance(batch[0], seese3.Navigation) and batch[0].frame.id == answer.frame.id
     assert isinstance(batch[1], seese3.NotFoundError)
+    # The error of a query has what the query alone would get.
+    assert (batch[1].reason, batch[1].field) == ("NOT_SERVED", "displacement.target_frame_id")
 
-    seen: list[int] = []
-    way = client.navigate_to(ROOM, 5, goal=60, on_step=lambda step: seen.append(step.step))
-    assert way.outcome == "reached" and seen == [step.step for step in way.steps]
-    assert way.steps[0].start_pose is not None and way.steps[-1].frame is not None
+    route = client.plan_route(ROOM, 5, goal=60)
+    assert route.outcome == "found" and len(route.hops) > 1
+    at = route.start.pose
+    for hop in route.hops:
+        at = at @ seese3.exp_se3(hop.motion)
+    np.testing.assert_allclose(at, route.hops[-1].frame.pose, atol=1e-9)
+    assert route.hops[-1].distance_remaining_m <= 0.25
+    nowhere = np.eye(4)
+    nowhere[0, 3] = 100.0
+    assert client.plan_route(ROOM, 5, goal_pose=nowhere).outcome == "goal_not_mapped"
 
     with pytest.raises(ValueError, match="exactly one of"):
         client.navigate(ROOM, 5)
-    with pytest.raises(ValueError, match="mode: 'Snap' is none of open_loop, snap, closed_loop"):
-        client.navigate(ROOM, 5, to=6, mode="Snap")
+    with pytest.raises(ValueError, match="step_mode: 'leap' is none of open_loop, snap, closed_loop"):
+        client.navigate(ROOM, 5, to=6, step_mode="leap")  # type: ignore[arg-type]
+    # The words of the command line are understood too.
+    assert client.navigate(ROOM, 5, to=6, step_mode="closed-loop").step_mode == "closed_loop"  # type: ignore[arg-type]
 
 
 def test_localization_of_features_and_images(client: seese3.Client, drawn: Path) -> None:
     room = seese3.Store(drawn).room(ROOM)
     assert room.images is not None
-    for view in (room.features[FEATURES][33], room.images[33], room.images[33].read_bytes()):
+    pixels = cv2_pixels(room.images[33])
+    views = (room.features[FEATURES][33], room.images[33], str(room.images[33]), room.images[33].read_bytes(), pixels)
+    for view in views:
         found = client.localize(view, rooms=ROOM, top_k=3)
-        assert found.places[0].frame.id == 33 and len(found.places) == 3
+        assert found.frames[0].frame.id == 33 and len(found.frames) == 3
         # A mapped view lies within the room's limit, and its pose is known to some centimetres.
         assert found.pose is not None and found.novelty is not None and found.novelty < 1
         assert found.room.name == ROOM and found.method in ("fitted_adapter", "similar_frames")
@@ -82,7 +111,7 @@ def test_localization_of_features_and_images(client: seese3.Client, drawn: Path)
 
     # A feature with its columns in another order is that of no image, though some frame is nearest.
     strange = client.localize(room.features[FEATURES][33][::-1], rooms=ROOM)
-    assert strange.pose is None and strange.method is None and len(strange.places) == 1
+    assert strange.pose is None and strange.method is None and len(strange.frames) == 1
     assert strange.novelty is not None and strange.novelty > 1
     assert strange.reason is not None and "not in the map" in strange.reason
 
@@ -107,24 +136,67 @@ def test_motions_and_latents(client: seese3.Client, drawn: Path) -> None:
     np.testing.assert_array_equal(encoding.features[1].values, rows[9])  # type: ignore[union-attr]
 
     by_rows = client.motion(3, 9, room=ROOM)
-    by_latents = client.motion(*map(seese3.Latent, encoding.latents), room=ROOM)
+    # A latent names its adapter, and one that does not needs it beside it.
+    by_latents = client.motion(encoding.latent(0), encoding.latent(1))
+    bare = [seese3.Latent(values) for values in encoding.latents]
+    with pytest.raises(seese3.InvalidFieldError, match="adapter"):
+        client.motion(*bare, room=ROOM)
+    np.testing.assert_array_equal(client.motion(*bare, adapter="robot").twist, by_latents.twist)
     np.testing.assert_allclose(by_rows.twist, by_latents.twist, atol=1e-9)
     assert by_rows.true_motion is not None and by_latents.true_motion is None and by_rows.covariance is None
 
 
 def test_evaluation_and_predictions_of_ones_own(client: seese3.Client, drawn: Path) -> None:
-    progress: list[tuple[int, int]] = []
-    report = client.evaluate(ROOM, stride=10, on_progress=lambda done, total: progress.append((done, total)))
-    scores = {one.name: one for one in report.navigators}
-    assert scores["oracle"].hits[0.1].rate == 1.0 and progress
+    # The only adapter was trained on every frame: it is not evaluated unless it is named, and then says so.
+    with pytest.raises(seese3.InvalidFieldError, match="held-out") as leaks:
+        client.evaluate(ROOM)
+    assert leaks.value.field == "adapter"
 
-    # A navigator that stays where it is scores what the identity scores.
-    pairs = [(row, row + 10) for row in range(110)]
-    mine = client.score(ROOM, [seese3.requests.Prediction(a, b, frame=a) for a, b in pairs])
-    assert mine.r2 is None and mine.n == 110
+    progress: list[tuple[int, int]] = []
+    report = client.evaluate(
+        ROOM, adapter="robot", stride=10, on_progress=lambda done, total: progress.append((done, total))
+    )
+    scores = {one.name: one for one in report.navigators}
+    assert scores["oracle"].hit(0.1).value == 1.0 and progress
+    np.testing.assert_allclose(scores["oracle"].thresholds, [0.1, 0.2, 0.3, 0.5])
+    with pytest.raises(KeyError):
+        scores["oracle"].hit(0.15)
     table = report.table()
     assert list(table.index) == list(scores) and table.loc["oracle", "hit@0.1"] == 1.0
+    baselines = {"identity", "random", "oracle"}
+    assert report.leaks
+    assert [name for name in table.index if table.loc[name, "leak"] != "LEAK"] == [
+        name for name in table.index if name in baselines
+    ]
     assert len(report.plot().lines) == len(scores)
+
+    # A navigator that stays where it is scores what the identity scores, by the same pairs.
+    pairs = client.split_pairs(ROOM, "whole", 10)
+    sources, targets = pairs.test.T
+    np.testing.assert_array_equal(targets - sources, 10)
+    mine = client.score(
+        ROOM, sources=sources, targets=targets, frames=sources, adapter="robot", split="whole", name="stay"
+    )
+    both = report.with_navigator(mine)
+    assert [one.name for one in both.navigators][-1] == "stay" and mine.navigators[0].latent_r2 is None
+    np.testing.assert_array_equal(both.navigators[-1].hits, scores["identity"].hits)
+    # Frames do not depend on the adapter, and its latents have seen the pairs.
+    assert both.table().loc["stay", "leak"] == ""
+    with pytest.raises(ValueError, match="different pairs: n"):
+        report.with_navigator(client.score(ROOM, [seese3.Prediction(0, 10, frame=0)], adapter="robot", split="whole"))
+    with pytest.raises(ValueError, match="'stay' is in both"):
+        both.with_navigator(mine)
+    with pytest.raises(seese3.InvalidFieldError, match="twice"):
+        client.score(ROOM, [seese3.Prediction(0, 10, frame=0)] * 2, adapter="robot")
+
+    # By latents, the frames that are retrieved are those nearest to the targets' own latents: the targets.
+    latents = client.encode(list(range(10, 20)), room=ROOM).latents
+    exact = client.score(ROOM, sources=range(10), targets=range(10, 20), latents=latents, adapter="robot")
+    assert exact.navigators[0].top1.value == 1.0 and exact.stride == 10 and exact.split is None
+    assert exact.navigators[0].leaks and exact.leaks
+    for arrays in ({"targets": [1]}, {"sources": [1], "targets": [2, 3], "frames": [1]}, {"sources": [0.5]}):
+        with pytest.raises(ValueError):
+            client.score(ROOM, **arrays)  # type: ignore[arg-type]
 
 
 def test_errors_say_which_field_and_why(client: seese3.Client) -> None:
@@ -138,7 +210,7 @@ def test_errors_say_which_field_and_why(client: seese3.Client) -> None:
     assert missing.value.reason == "NOT_SERVED" and isinstance(missing.value, LookupError)
 
     with pytest.raises(seese3.DeadlineError):
-        client.evaluate(ROOM, deadline_s=1e-4)
+        client.evaluate(ROOM, adapter="robot", deadline_s=1e-4)
     with pytest.raises(seese3.PreconditionError):
         client.delete_room(ROOM)
 
@@ -178,34 +250,43 @@ def test_changes_of_the_catalog(store: Path) -> None:
     first, rest = slice(0, 80), slice(80, None)
     with seese3.serve(store, "--writable") as server, server.client(deadline_s=60) as client:
         upload = seese3.Upload(room.poses[first], [(source, rows[first])])
-        assert client.create_room("copy", upload, validate_only=True).revision is None
-        made = client.create_room("copy", upload)
+        assert client.server_info().writable
+        assert client.upload_room("copy", upload, validate_only=True).revision is None
+        made = client.upload_room("copy", upload)
         assert made.created and made.served and client.room("copy").frame_count == 80
-        assert not client.create_room("copy", upload).created
+        assert not client.upload_room("copy", upload).created
 
+        # Nothing is replaced unasked.
         more = seese3.Upload(room.poses[rest], [(source, rows[rest])])
-        assert client.create_room("copy", more, extend=True).revision.revision == 2
+        with pytest.raises(seese3.ExistsError, match="exists in revision 1"):
+            client.upload_room("copy", more)
+        with pytest.raises(seese3.NotFoundError):
+            client.upload_room("nowhere", more, mode="replace")
+        assert client.upload_room("copy", more, mode="extend").revision.revision == 2
         np.testing.assert_array_equal(seese3.Store(store).room("copy").features[FEATURES], rows)
 
         manifest, weights = seese3.Store(store).adapter_files("robot")
-        assert client.publish_adapter("again", manifest, weights).served
+        assert client.upload_adapter("again", manifest, weights).served
         assert "again" in [adapter.name for adapter in client.adapters()]
 
-        # What is chosen can be taken back, and names are those that other methods take.
+        # A default can be cleared, and names are those that other methods take.
         client.set_default(room=ROOM, adapter="again")
-        assert client.unset_default(room=ROOM) == []
+        assert client.clear_default(adapter_of_room=ROOM) == []
 
         done: list[int] = []
-        fitted = client.refit_room("copy", features=FEATURES, on_progress=lambda n, _: done.append(n))
+        fitted = client.fit_adapter("copy", features=FEATURES, on_progress=lambda n, _: done.append(n))
         assert fitted.created and done
         defaults = client.set_default(room="copy", adapter="again")
-        assert [(one.name, one.adapter) for one in defaults] == [("copy", "again")]
-        assert "adapter" in [one.kind for one in client.set_default(adapter="again", revision=1)]
-        client.unset_default(adapter="again")
+        assert defaults == [seese3.CatalogDefault(room="copy", adapter="again")]
+        assert seese3.CatalogDefault(adapter="again", revision=1) in client.set_default(adapter="again", revision=1)
+        client.clear_default(adapter="again")
         assert client.room("copy").adapters[0] == "again"
         assert client.set_default(room="copy", revision=1) and client.room("copy").frame_count == 80
-        assert client.roll_back_default() and client.room("copy").frame_count == 120
-        client.roll_back_default()
+        assert client.room("copy", revision=2).frame_count == 120
+        assert client.frames("copy", room_revision=2).poses.shape[0] == 120
+        client.clear_default(room="copy")
+        assert client.room("copy").frame_count == 120
+        client.clear_default(adapter_of_room="copy")
 
         assert client.delete_room("copy", revision=1) == [1]
         client.delete_adapter(fitted.revision.name)
@@ -226,7 +307,7 @@ def test_unfit_uploads_are_refused_before_they_are_sent() -> None:
         ("names", ["one", 2], "names: row 1"),
         ("timestamps_ns", [0, 1.5], "timestamps_ns: row 1"),
         ("timestamps_ns", [0, 2**63], "timestamps_ns: row 1"),
-        ("sequences", [0, -1], "sequences: row 1"),
+        ("segments", [0, -1], "segments: row 1"),
         ("images", [b"", "x.jpg"], "images: row 1"),
         ("images", [b"", Path("/nowhere.jpg")], "is no file"),
     ):
@@ -278,7 +359,7 @@ def test_arguments_that_are_none_are_refused_by_their_names(client: seese3.Clien
         (lambda: client.navigate(ROOM, 1, to=2, steps=-1), "steps: -1"),
         (lambda: client.navigate(ROOM, 1, twist=0), "twist: is"),
         (lambda: client.navigate(ROOM, 1, twist=np.zeros(6, complex)), "complex"),
-        (lambda: client.navigate_batch(ROOM, [seese3.Question(1, to=2), seese3.Question(1)]), r"questions\[1\]"),
+        (lambda: client.navigate_batch(ROOM, [NavigationQuery(1, to=2), NavigationQuery(1)]), r"queries\[1\]"),
         (lambda: client.localize(1, rooms=ROOM, deadline_s=float("nan")), "deadline_s"),
         (lambda: client.track(resume_token=b"x"), "last_sequence"),
         (lambda: client.set_default(revision=3), "room and adapter"),
@@ -295,7 +376,7 @@ def test_arguments_that_are_none_are_refused_by_their_names(client: seese3.Clien
         client.encode(b"an image")
 
     # For ever, and not a deadline that has passed.
-    assert client.localize(1, rooms=ROOM, deadline_s=float("inf")).places[0].frame.id == 1
+    assert client.localize(1, rooms=ROOM, deadline_s=float("inf")).frames[0].frame.id == 1
     client.close()
     with pytest.raises(seese3.SeeseError, match="closed"):
         client.rooms()

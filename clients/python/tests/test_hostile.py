@@ -98,7 +98,7 @@ def test_a_stream_that_is_not_answered_is_given_up() -> None:
     with hostile("OdometryService/Track", only_started) as client, client.track(seese3.TrackConfig(room="r")) as track:
         with pytest.raises(seese3.DeadlineError):
             track.step(VIEW, 0, deadline_s=0.3)
-        assert track.last_sequence == 0, "the step did not happen"
+        assert track.last_sequence_number == 0, "the step did not happen"
     ends.set()
     assert time.monotonic() - began >= 0.6
 
@@ -106,12 +106,14 @@ def test_a_stream_that_is_not_answered_is_given_up() -> None:
 def test_an_answer_to_another_frame_is_refused() -> None:
     def shifted(requests: Any, _context: Any) -> Iterator[bytes]:
         for number, _ in enumerate(requests):
-            update = odometry_pb2.TrackUpdate(sequence=number - (number > 2))
+            pose = geometry_pb2.Pose(position=geometry_pb2.Vector3(), orientation=UNIT)
+            camera = odometry_pb2.TrackedBody(odom_pose=geometry_pb2.PoseWithCovariance(pose=pose))
+            update = odometry_pb2.TrackUpdate(sequence_number=number - (number > 2), camera=camera)
             answer = odometry_pb2.TrackResponse(update=update) if number else odometry_pb2.TrackResponse()
             yield answer.SerializeToString()
 
     with hostile("OdometryService/Track", shifted) as client, client.track(seese3.TrackConfig(room="r")) as track:
-        assert [track.step(VIEW, time).sequence for time in (1, 2)] == [1, 2]
+        assert [track.step(VIEW, time).sequence_number for time in (1, 2)] == [1, 2]
         with pytest.raises(seese3.AnswerError, match="frame 2 where frame 3"):
             track.step(VIEW, 3)
-        assert track.last_sequence == 2
+        assert track.last_sequence_number == 2

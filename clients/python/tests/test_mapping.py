@@ -18,8 +18,8 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
     """A video of the first visit to a drawn room, and the true positions of the camera."""
     folder = tmp_path_factory.mktemp("filmed")
     drawn = folder / "drawn"
-    options = ["--suite", "returns", "--rooms", "1", "--frames", 2 * FRAMES, "--seed", "5", "--encode", "pixels"]
-    seese3.run("studio", *options, "--out", drawn, "--keep-images")
+    options = ["--suite", "returns", "--rooms", "1", "--frames", 2 * FRAMES, "--seed", "5", "--encoder", "pixels"]
+    seese3.run("studio", *options, "--store", drawn, "--keep-images")
     room = seese3.Store(drawn).room("studio5-0000")
     images = sorted((drawn / "images" / "studio5-0000").glob("*.png"))[:FRAMES]
 

@@ -6,7 +6,7 @@ import zlib
 import numpy as np
 import pytest
 from seese3.answers import Camera
-from seese3.geometry import pose_matrix, wire_pose, wire_twist
+from seese3.geometry import exp_se3, log_se3, pose_matrix, wire_pose, wire_twist
 from seese3.requests import DepthImage, wire_camera
 from seese3.v1 import geometry_pb2 as pb
 from seese3.views import Feature, wire_view
@@ -65,7 +65,9 @@ def test_depths_are_a_png_of_millimeters() -> None:
 
 
 def test_a_view_that_is_nothing_of_the_kind_is_refused() -> None:
-    for view in ("frame.jpg", True, None, [1.0, 2.0]):
+    with pytest.raises(FileNotFoundError, match="nowhere.jpg"):
+        wire_view("nowhere.jpg")
+    for view in (True, None, [1.0, 2.0]):
         with pytest.raises(TypeError, match="a view is"):
             wire_view(view)  # type: ignore[arg-type]
     for rows in (np.zeros((2, 3)), np.arange(3)):
@@ -85,3 +87,37 @@ def test_a_camera_comes_back_from_the_wire() -> None:
     # By hand: numbers that are left out are absent on the wire.
     message = wire_camera(Camera(640, 480, 525.0))
     assert message == pb.CameraIntrinsics(width=640, height=480, fx=525.0)
+
+
+def test_motions_are_those_of_the_matrix_exponential() -> None:
+    """The series Σ Xⁿ/n! of the 4×4 matrix of a twist, and back."""
+    random = np.random.default_rng(3)
+    for angle in (0.0, 1e-9, 1e-3, 0.3, 2.0, 3.1):
+        axis = random.normal(size=3)
+        twist = np.concatenate([random.normal(size=3), angle * axis / np.linalg.norm(axis)])
+        x, y, z = twist[3:]
+        matrix = np.zeros((4, 4))
+        matrix[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+        matrix[:3, 3] = twist[:3]
+        expected, term = np.eye(4), np.eye(4)
+        for n in range(1, 60):
+            term = term @ matrix / n
+            expected = expected + term
+        np.testing.assert_allclose(exp_se3(twist), expected, atol=1e-12)
+        np.testing.assert_allclose(log_se3(expected), twist, atol=1e-9)
+    several = random.normal(size=(5, 6)) / 3
+    np.testing.assert_allclose(log_se3(exp_se3(several)), several, atol=1e-9)
+    for bad in (np.zeros(5), np.zeros((2, 2, 6))):
+        with pytest.raises(ValueError):
+            exp_se3(bad)
+
+
+def test_pixels_are_a_png_that_opencv_reads() -> None:
+    cv2 = pytest.importorskip("cv2")
+    pixels = np.random.default_rng(1).integers(0, 256, (5, 7, 3), dtype=np.uint8)
+    read = cv2.imdecode(np.frombuffer(wire_view(pixels).image, np.uint8), cv2.IMREAD_COLOR)
+    np.testing.assert_array_equal(read[:, :, ::-1], pixels)
+    gray = cv2.imdecode(np.frombuffer(wire_view(pixels[:, :, 0]).image, np.uint8), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(gray, pixels[:, :, 0])
+    with pytest.raises(ValueError, match="an image is"):
+        wire_view(pixels[:, :, :2])

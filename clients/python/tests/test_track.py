@@ -25,7 +25,7 @@ def followed(track: seese3.Track, rows: np.ndarray, start: int = 0) -> list[sees
 
 def poses_of(updates: list[seese3.TrackUpdate]) -> np.ndarray:
     unknown = np.full((4, 4), np.nan)
-    return np.array([unknown if one.map_from_camera is None else one.map_from_camera for one in updates])
+    return np.array([unknown if one.camera.map_pose is None else one.camera.map_pose for one in updates])
 
 
 def is_near(found: list[seese3.TrackUpdate], expected: list[seese3.TrackUpdate]) -> None:
@@ -43,13 +43,13 @@ def test_a_camera_is_followed(client: seese3.Client, drawn: Path) -> None:
     with client.track(config) as track:
         updates = followed(track, room.features[FEATURES][:first_visit])
         refused = track.step(room.features[FEATURES][0], 0)
-    assert [one.sequence for one in updates] == list(range(1, first_visit + 1))
+    assert [one.sequence_number for one in updates] == list(range(1, first_visit + 1))
     assert {one.status for one in updates[10:]} == {"tracking"}
 
     # The frames are the map's own: whoever finds the nearest frame knows the pose.
     errors = np.linalg.norm(poses_of(updates)[:, :3, 3] - room.poses[:first_visit, :3, 3], axis=1)
     assert np.median(errors) < 0.05
-    assert updates[-1].map_from_camera_covariance is not None and updates[-1].map_from_base is None
+    assert updates[-1].camera.map_covariance is not None and updates[-1].base is None
     assert isinstance(refused, seese3.TrackRefusal) and refused.reason == "late"
 
 
@@ -125,11 +125,11 @@ def test_a_recording_is_followed_ahead_of_its_answers(drawn: Path, tmp_path: Pat
             assert track.resumed >= 1
 
     for updates in (ahead, cut):
-        assert [one.sequence for one in updates] == list(range(1, 61))
+        assert [one.sequence_number for one in updates] == list(range(1, 61))
         is_near(updates, whole)
     np.testing.assert_array_equal(poses_of(ahead), poses_of(whole))
     # 17 frames had been sent; nobody asked for the answers to 16 of them, and the stream knows them all the same.
-    assert after[0].sequence == 18
+    assert after[0].sequence_number == 18
 
 
 def test_newer_frames_that_take_the_place_of_older_ones_are_counted(client: seese3.Client, drawn: Path) -> None:
@@ -142,7 +142,7 @@ def test_newer_frames_that_take_the_place_of_older_ones_are_counted(client: sees
         assert track.start.adapter.name == "robot"
     refused = sum(one.frames for one in answers if isinstance(one, seese3.TrackRefusal))
     assert refused + sum(isinstance(one, seese3.TrackUpdate) for one in answers) == len(frames)
-    assert answers[-1].sequence == len(frames)
+    assert answers[-1].sequence_number == len(frames)
 
 
 def test_a_token_carries_a_stream_to_another_client(server: seese3.Server, drawn: Path) -> None:
@@ -151,13 +151,13 @@ def test_a_token_carries_a_stream_to_another_client(server: seese3.Server, drawn
         whole = followed(track, rows)
     with server.client() as client, client.track(seese3.TrackConfig(room=ROOM)) as track:
         followed(track, rows[:20])
-        token, sent = track.resume_token, track.last_sequence
+        token, sent = track.resume_token, track.last_sequence_number
     assert sent == 20
-    with server.client() as client, client.track(resume_token=token, last_sequence=sent) as track:
+    with server.client() as client, client.track(resume_token=token, last_sequence_number=sent) as track:
         rest = followed(track, rows[20:], start=20)
     is_near(rest, whole[20:])
     # The odometry begins anew.
-    np.testing.assert_allclose(rest[0].odom_from_camera[:3, 3], 0, atol=0.1)
+    np.testing.assert_allclose(rest[0].camera.odom_pose[:3, 3], 0, atol=0.1)
 
 
 def test_what_a_stream_refuses(client: seese3.Client) -> None:

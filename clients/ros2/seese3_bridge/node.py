@@ -15,21 +15,26 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
-from seese3.v1 import odometry_pb2
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from tf2_ros import TransformBroadcaster
 
-from . import answers, requests
+from . import answers, connection, requests
 from .stream import SAMPLES, Stream
+from .v1 import odometry_pb2
 
 LEVELS = {"TRACKING": 0, "DEGRADED": 1, "RELOCALIZING": 1, "LOST": 2}
 # What another sensor said so long ago says nothing of a frame, nanoseconds.
 OLD_NS = 50_000_000
 # Images of several cameras belong together when they were taken within this time, nanoseconds.
 TOGETHER_NS = 20_000_000
-KEEPALIVE = [("grpc.keepalive_time_ms", 20_000), ("grpc.keepalive_timeout_ms", 10_000)]
+# What TF is published: odom -> base and map -> odom of the server; only map -> odom of the robot's own odometry, as AMCL
+# does; or nothing.
+TF = ("odom_and_map", "map_only", "none")
+# Frames whose odometry is kept until their answers come.
+MOST_DRIVEN = 100
 PARAMETERS = {"server": "127.0.0.1:50051", "room": "", "adapter": "", "camera_frame": "camera_optical_frame",
-              "base_frame": "base_link", "publish_tf": False, "use_camera_info": False, "wheel_drift": 0.05,
+              "odom_frame": "odom", "map_frame": "map", "base_frame": "base_link", "tf": "odom_and_map", "tls_ca": "", "tls_cert": "", "tls_key": "",
+              "token_file": "", "use_camera_info": False, "wheel_drift": 0.05,
               "use_wheel_covariance": False, "trust_odometry": False, "inertial": False, "depth": False,
               "depth_deviation": 0.005}
 
@@ -57,11 +62,16 @@ class Bridge(Node):
         self.pose = self.create_publisher(PoseWithCovarianceStamped, "~/pose", 10)
         self.diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         has_base = self.config.HasField("base_from_camera")
-        self.tf = TransformBroadcaster(self) if has_base or self.given["publish_tf"] else None
+        if self.given["tf"] not in TF:
+            raise ValueError(f"tf is {self.given['tf']!r}, and none of: {', '.join(TF)}")
+        if self.given["tf"] == "map_only" and not has_base:
+            raise ValueError("tf: map_only needs base_from_camera, and ~/wheels as the robot's odometry")
+        self.tf = TransformBroadcaster(self) if self.given["tf"] != "none" else None
+        # The robot's own odometry of the frames that have no answer yet, by their stamps.
+        self.driven = collections.OrderedDict()
 
-        # A link that is gone is noticed by pings.
-        self.channel = grpc.insecure_channel(self.given["server"], KEEPALIVE)
-        self.stream = Stream(self.channel, self.config)
+        self.channel = connection.channel(self.given)
+        self.stream = Stream(self.channel, self.config, connection.metadata(self.given))
         self.subscribe(has_base)
 
     def numbers(self, name):
@@ -72,7 +82,8 @@ class Bridge(Node):
         given = self.given
         config = odometry_pb2.TrackConfig(
             room=given["room"], adapter=given["adapter"], back_pressure=odometry_pb2.BACK_PRESSURE_NEWEST,
-            frames=odometry_pb2.FrameNames(camera=given["camera_frame"], base=given["base_frame"]),
+            frames=odometry_pb2.FrameNames(map=given["map_frame"], odom=given["odom_frame"], camera=given["camera_frame"],
+                                          base=given["base_frame"]),
             base_from_camera=requests.mounting("base_from_camera", self.numbers("base_from_camera")),
             gravity_in_map=requests.direction("gravity_in_map", self.numbers("gravity_in_map")),
             trust_odometry=given["trust_odometry"])
@@ -128,10 +139,13 @@ class Bridge(Node):
         self.send_waiting()
         self.counts["images"] += 1
         stamp = requests.nanoseconds(image.header.stamp)
-        frame = odometry_pb2.TrackFrame(timestamp_ns=stamp, sequence=self.counts["images"], view=view)
+        frame = odometry_pb2.TrackFrame(timestamp_ns=stamp, sequence_number=self.counts["images"], view=view)
         # Wheels that come less often than images are sent once: sent twice, the robot would stand still in between.
         if self.wheels is not None and abs(self.wheels[0] - stamp) <= OLD_NS:
             frame.odometry.CopyFrom(self.wheels[1])
+            self.driven[stamp] = self.wheels[1].pose
+            while len(self.driven) > MOST_DRIVEN:
+                self.driven.popitem(last=False)
             self.wheels = None
         while self.samples and self.samples[0].timestamp_ns <= stamp:
             frame.inertial_samples.append(self.samples.popleft())
@@ -216,12 +230,13 @@ class Bridge(Node):
             self.gravity = requests.nanoseconds(imu.header.stamp), measured
 
     def on_initial_pose(self, message):
-        if message.header.frame_id not in ("", "map"):
-            self.get_logger().error(f"/initialpose is in {message.header.frame_id}, and must be in map: not sent")
+        if message.header.frame_id not in ("", self.given["map_frame"]):
+            self.get_logger().error(
+                f"/initialpose is in {message.header.frame_id}, and must be in {self.given['map_frame']}: not sent")
             return
         has_base = self.config.HasField("base_from_camera")
         body = self.given["base_frame"] if has_base else self.given["camera_frame"]
-        known = odometry_pb2.InitialPose(pose=requests.wire_pose(message.pose.pose, "map", body))
+        known = odometry_pb2.InitialPose(pose=requests.wire_pose(message.pose.pose, self.given["map_frame"], body))
         self.offer(odometry_pb2.TrackRequest(set_initial_pose=odometry_pb2.SetInitialPose(initial_pose=known)))
 
     # What the server says.
@@ -237,13 +252,22 @@ class Bridge(Node):
         self.odom.publish(answers.odometry_message(update, Odometry))
         if (message := answers.pose_message(update, PoseWithCovarianceStamped)) is not None:
             self.pose.publish(message)
-        if self.tf is not None:
-            self.tf.sendTransform(answers.transforms(update, TransformStamped))
+        self.broadcast(update)
         name = answers.status_name(update)
         against = ", ".join(answers.sensor_names(update))
         text = f"{name}: {update.reason}" + (f" (contradicted: {against})" if against else "")
         self.report(LEVELS.get(name, 2), text, update.timestamp_ns)
         self.counts["updates"] += 1
+
+    def broadcast(self, update):
+        """Publishes TF."""
+        if self.given["tf"] == "odom_and_map":
+            self.tf.sendTransform(answers.transforms(update, TransformStamped))
+        elif self.given["tf"] == "map_only":
+            driven = self.driven.pop(update.timestamp_ns, None)
+            found = answers.map_transform(update, driven, self.given["odom_frame"], TransformStamped)
+            if found is not None:
+                self.tf.sendTransform([found])
 
     def refused(self, refusal):
         reason = odometry_pb2.TrackRefusalReason.Name(refusal.reason).removeprefix("TRACK_REFUSAL_REASON_")

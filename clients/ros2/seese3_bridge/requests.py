@@ -5,7 +5,7 @@ import math
 
 import numpy
 from PIL import Image as Picture
-from seese3.v1 import geometry_pb2, odometry_pb2
+from .v1 import geometry_pb2, odometry_pb2
 
 # Encodings of sensor_msgs/Image, as Pillow names the modes of the picture and of its bytes.
 ENCODINGS = {"rgb8": ("RGB", "RGB"), "bgr8": ("RGB", "BGR"), "rgba8": ("RGB", "RGBX"), "bgra8": ("RGB", "BGRX"),

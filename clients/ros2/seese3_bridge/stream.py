@@ -3,7 +3,7 @@
 import collections
 import threading
 
-from seese3.v1 import odometry_pb2, odometry_pb2_grpc
+from .v1 import odometry_pb2, stub
 
 # Frames that may wait for the server; the oldest is dropped for another. Two, because a frame that waited for other
 # cameras is offered together with the next one.
@@ -62,8 +62,9 @@ class Requests:
 class Stream:
     """Frames in, answers out; goes on with the last token when the server goes away."""
 
-    def __init__(self, channel, config):
-        self.stub, self.config, self.token = odometry_pb2_grpc.OdometryServiceStub(channel), config, b""
+    def __init__(self, channel, config, metadata=()):
+        self.stub, self.config, self.token = stub("OdometryService", channel), config, b""
+        self.metadata = metadata
         self.requests = Requests()
 
     def offer(self, request):
@@ -79,7 +80,7 @@ class Stream:
         """Answers until the call ends."""
         call = self.requests.begin()
         try:
-            for answer in self.stub.Track(self.sent(call)):
+            for answer in self.stub.Track(self.sent(call), metadata=self.metadata):
                 self.token = answer.resume_token or self.token
                 yield answer
         finally:

@@ -21,7 +21,7 @@ from rosbags.rosbag2 import Reader, Writer
 stand_in.install()
 
 from nav_msgs.msg import Odometry  # noqa: E402
-from seese3.v1 import catalog_pb2, catalog_pb2_grpc  # noqa: E402
+from seese3_bridge.v1 import catalog_pb2, stub  # noqa: E402
 from seese3_bridge import node as bridge_node  # noqa: E402
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu  # noqa: E402
 
@@ -140,8 +140,7 @@ def record(path, images, bases, camera, has_acceleration):
 
 def camera_of(channel, room):
     """The camera that a room was mapped with, in any unit of pixels."""
-    catalog = catalog_pb2_grpc.CatalogServiceStub(channel)
-    return catalog.GetRoom(catalog_pb2.GetRoomRequest(room=room)).room.camera
+    return stub("CatalogService", channel).GetRoom(catalog_pb2.GetRoomRequest(room=room)).camera
 
 
 def play(path, node):

@@ -11,9 +11,9 @@ from PIL import Image as Picture
 stand_in.install()
 
 from nav_msgs.msg import Odometry  # noqa: E402
-from seese3.v1 import odometry_pb2  # noqa: E402
 from seese3_bridge import requests  # noqa: E402
 from seese3_bridge.stream import Requests  # noqa: E402
+from seese3_bridge.v1 import odometry_pb2  # noqa: E402
 from sensor_msgs.msg import CameraInfo, Image, Imu  # noqa: E402
 
 
@@ -174,18 +174,18 @@ def test_only_the_newest_frames_wait():
     waiting = Requests()
 
     def frame(number):
-        return odometry_pb2.TrackRequest(frame=odometry_pb2.TrackFrame(sequence=number))
+        return odometry_pb2.TrackRequest(frame=odometry_pb2.TrackFrame(sequence_number=number))
 
     pose = odometry_pb2.TrackRequest(set_initial_pose=odometry_pb2.SetInitialPose())
     assert [waiting.offer(request) for request in (frame(1), pose, frame(2), frame(3))] == [False, False, False, True]
 
     sent = waiting.of_call(waiting.begin())
     assert next(sent) == pose
-    assert [next(sent).frame.sequence for _ in range(2)] == [2, 3]
+    assert [next(sent).frame.sequence_number for _ in range(2)] == [2, 3]
     waiting.offer(frame(4))
     second = waiting.of_call(waiting.begin())
     assert list(sent) == []
-    assert next(second).frame.sequence == 4
+    assert next(second).frame.sequence_number == 4
 
 
 def test_an_inertial_sample_is_what_the_message_says():

@@ -112,29 +112,17 @@ impl Client {
             .results)
     }
 
-    /// Navigates to a goal. `feedback` is called for each feedback message.
+    /// Plans a route to a goal.
     ///
     /// # Errors
-    /// [`Error::Refused`], or [`Error::NoReport`] if the stream ends without a result.
-    pub async fn navigate_to(
-        &self,
-        request: pb::NavigateToRequest,
-        mut feedback: impl FnMut(pb::NavigateToFeedback),
-    ) -> Result<pb::NavigateToResult, Error> {
-        let mut service = NavigationServiceClient::new(self.channel.clone());
-        let until = Instant::now() + self.deadline;
-        let opened = in_time(until, service.navigate_to(self.request(request))).await?;
-        let mut events = opened.into_inner();
-
-        while let Some(pb::NavigateToResponse { event }) = in_time(until, events.message()).await? {
-            match event {
-                Some(pb::navigate_to_response::Event::Result(result)) => return Ok(result),
-                Some(pb::navigate_to_response::Event::Feedback(step)) => feedback(step),
-                None => {}
-            }
-        }
-
-        Err(Error::NoReport)
+    /// [`Error::Refused`] or [`Error::Deadline`].
+    pub async fn plan_route(&self, request: pb::PlanRouteRequest) -> Result<pb::Route, Error> {
+        let mut service = NavigationServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
+        Ok(self
+            .in_time(service.plan_route(self.request(request)))
+            .await?
+            .into_inner())
     }
 
     /// The stored frames most similar to a view, with their poses.
@@ -214,7 +202,7 @@ impl Client {
         Ok(self.in_time(service.track(requests)).await?.into_inner())
     }
 
-    /// All frames of a room, read page by page. `neighbours_within` adds to each frame its
+    /// All frames of a room, read page by page. `neighbors_within` adds to each frame its
     /// neighbors within this motion norm, meters and radians mixed. `thumbnail_width` adds a JPEG
     /// of this width, pixels, if the server provides images.
     ///
@@ -223,7 +211,7 @@ impl Client {
     pub async fn frames(
         &self,
         room: &str,
-        neighbours_within: Option<f64>,
+        neighbors_within: Option<f64>,
         thumbnail_width: Option<u32>,
     ) -> Result<Vec<pb::RoomFrame>, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone())
@@ -232,10 +220,11 @@ impl Client {
         let mut pages = Pages::default();
         loop {
             let request = self.request(pb::ListFramesRequest {
+                room_revision: None,
                 room: room.to_owned(),
                 page_size: 0,
                 page_token: pages.token.clone(),
-                neighbours_within,
+                neighbors_within,
                 thumbnail_width,
             });
             let page = self
@@ -275,19 +264,30 @@ impl Client {
         }
     }
 
-    /// One room, by name.
+    /// The version, the abilities and the limits of the server.
     ///
     /// # Errors
     /// [`Error::Refused`].
-    pub async fn room(&self, room: &str) -> Result<Option<pb::Room>, Error> {
+    pub async fn server_info(&self) -> Result<pb::ServerInfo, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
+        let request = self.request(pb::GetServerInfoRequest {});
         Ok(self
-            .in_time(service.get_room(self.request(pb::GetRoomRequest {
-                room: room.to_owned(),
-            })))
+            .in_time(service.get_server_info(request))
             .await?
-            .into_inner()
-            .room)
+            .into_inner())
+    }
+
+    /// The current revision of a room, by name.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn room(&self, room: &str) -> Result<pb::Room, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone());
+        let request = self.request(pb::GetRoomRequest {
+            room: room.to_owned(),
+            room_revision: None,
+        });
+        Ok(self.in_time(service.get_room(request)).await?.into_inner())
     }
 
     /// All adapters, read page by page.
@@ -315,21 +315,21 @@ impl Client {
         }
     }
 
-    /// One adapter, by name.
+    /// The current revision of an adapter, by name.
     ///
     /// # Errors
     /// [`Error::Refused`].
-    pub async fn adapter(&self, adapter: &str) -> Result<Option<pb::Adapter>, Error> {
+    pub async fn adapter(&self, adapter: &str) -> Result<pb::Adapter, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
         let request = self.request(pb::GetAdapterRequest {
             adapter: adapter.to_owned(),
+            adapter_revision: None,
         });
 
         Ok(self
             .in_time(service.get_adapter(request))
             .await?
-            .into_inner()
-            .adapter)
+            .into_inner())
     }
 
     /// Publishes a room from a `RoomUpload`, batches of frames and an `UploadEnd`, in this order.
@@ -338,13 +338,13 @@ impl Client {
     /// [`Error::Refused`]; [`Error::Deadline`] if the connection takes no message for as long as the
     /// deadline, or there is no response within it after the last one. The room may then still be
     /// published.
-    pub async fn create_room(
+    pub async fn upload_room(
         &self,
-        messages: impl Stream<Item = pb::CreateRoomRequest> + Send + 'static,
-    ) -> Result<pb::CreateRoomResponse, Error> {
+        messages: impl Stream<Item = pb::UploadRoomRequest> + Send + 'static,
+    ) -> Result<pb::UploadRoomResponse, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
         let (messages, last_taken) = observed(messages);
-        self.uploaded(service.create_room(messages), last_taken)
+        self.uploaded(service.upload_room(messages), last_taken)
             .await
     }
 
@@ -352,14 +352,14 @@ impl Client {
     /// order.
     ///
     /// # Errors
-    /// As [`Client::create_room`].
-    pub async fn publish_adapter(
+    /// As [`Client::upload_room`].
+    pub async fn upload_adapter(
         &self,
-        messages: impl Stream<Item = pb::PublishAdapterRequest> + Send + 'static,
-    ) -> Result<pb::PublishAdapterResponse, Error> {
+        messages: impl Stream<Item = pb::UploadAdapterRequest> + Send + 'static,
+    ) -> Result<pb::UploadAdapterResponse, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
         let (messages, last_taken) = observed(messages);
-        self.uploaded(service.publish_adapter(messages), last_taken)
+        self.uploaded(service.upload_adapter(messages), last_taken)
             .await
     }
 
@@ -369,18 +369,18 @@ impl Client {
     /// # Errors
     /// [`Error::Refused`], [`Error::Deadline`] if no message comes for as long as the deadline, or
     /// [`Error::NoReport`] if the stream ends without a result.
-    pub async fn refit_room(
+    pub async fn fit_adapter(
         &self,
-        request: pb::RefitRoomRequest,
-        mut progress: impl FnMut(pb::RefitProgress),
-    ) -> Result<pb::RefitResult, Error> {
+        request: pb::FitAdapterRequest,
+        mut progress: impl FnMut(pb::FitProgress),
+    ) -> Result<pb::FitResult, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
-        let opened = self.in_time(service.refit_room(request)).await?;
+        let opened = self.in_time(service.fit_adapter(request)).await?;
         let mut events = opened.into_inner();
-        while let Some(pb::RefitRoomResponse { event }) = self.in_time(events.message()).await? {
+        while let Some(pb::FitAdapterResponse { event }) = self.in_time(events.message()).await? {
             match event {
-                Some(pb::refit_room_response::Event::Result(result)) => return Ok(result),
-                Some(pb::refit_room_response::Event::Progress(step)) => progress(step),
+                Some(pb::fit_adapter_response::Event::Result(result)) => return Ok(result),
+                Some(pb::fit_adapter_response::Event::Progress(step)) => progress(step),
                 None => {}
             }
         }
@@ -388,15 +388,15 @@ impl Client {
         Err(Error::NoReport)
     }
 
-    /// Sets or clears the default revision of a name or the default adapter of a room. Returns all
-    /// current defaults.
+    /// Sets the default revision of a room or an adapter, or the default adapter of a room. Returns
+    /// all current defaults.
     ///
     /// # Errors
     /// [`Error::Refused`].
     pub async fn set_default(
         &self,
         request: pb::SetDefaultRequest,
-    ) -> Result<Vec<pb::Default>, Error> {
+    ) -> Result<Vec<pb::CatalogDefault>, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
         let answer = self
             .in_time(service.set_default(self.request(request)))
@@ -404,17 +404,17 @@ impl Client {
         Ok(answer.into_inner().defaults)
     }
 
-    /// Undoes the last change of a default. Returns all current defaults.
+    /// Clears a default. Returns all current defaults.
     ///
     /// # Errors
     /// [`Error::Refused`].
-    pub async fn roll_back_default(
+    pub async fn clear_default(
         &self,
-        request: pb::RollBackDefaultRequest,
-    ) -> Result<Vec<pb::Default>, Error> {
+        request: pb::ClearDefaultRequest,
+    ) -> Result<Vec<pb::CatalogDefault>, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
         let answer = self
-            .in_time(service.roll_back_default(self.request(request)))
+            .in_time(service.clear_default(self.request(request)))
             .await?;
         Ok(answer.into_inner().defaults)
     }
@@ -470,6 +470,22 @@ impl Client {
         }
 
         Err(Error::NoReport)
+    }
+
+    /// The pairs and the candidate frames of a split.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] or [`Error::Deadline`].
+    pub async fn list_pairs(
+        &self,
+        request: pb::ListPairsRequest,
+    ) -> Result<pb::ListPairsResponse, Error> {
+        let mut service = EvaluationServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
+        Ok(self
+            .in_time(service.list_pairs(self.request(request)))
+            .await?
+            .into_inner())
     }
 
     /// Scores external predictions.
@@ -549,14 +565,14 @@ mod tests {
             poses: vec![0; 1 << 20],
             ..pb::FrameBatch::default()
         };
-        let message = Some(pb::create_room_request::Message::Frames(frames));
-        let messages = vec![pb::CreateRoomRequest { message }; 100];
-        let upload = client.create_room(tokio_stream::iter(messages)).await;
+        let message = Some(pb::upload_room_request::Message::Frames(frames));
+        let messages = vec![pb::UploadRoomRequest { message }; 100];
+        let upload = client.upload_room(tokio_stream::iter(messages)).await;
         assert!(matches!(upload, Err(Error::Deadline)), "{upload:?}");
-        let upload = client.publish_adapter(tokio_stream::iter([])).await;
+        let upload = client.upload_adapter(tokio_stream::iter([])).await;
         assert!(matches!(upload, Err(Error::Deadline)), "{upload:?}");
         let fit = client
-            .refit_room(pb::RefitRoomRequest::default(), |_| ())
+            .fit_adapter(pb::FitAdapterRequest::default(), |_| ())
             .await;
         assert!(matches!(fit, Err(Error::Deadline)), "{fit:?}");
         let stream = client.track(tokio_stream::iter([])).await;

@@ -59,6 +59,15 @@ impl Error {
         }
     }
 
+    /// The reason of a refusal, as in `google.rpc.ErrorInfo`: one of docs/errors.md.
+    pub fn reason(&self) -> Option<String> {
+        let Self::Refused(status) = self else {
+            return None;
+        };
+        let details = status.get_error_details();
+        details.error_info().map(|info| info.reason.clone())
+    }
+
     /// The invalid request field, if the server reports one.
     pub fn field(&self) -> Option<String> {
         let Self::Refused(status) = self else {

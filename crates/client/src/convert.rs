@@ -124,6 +124,39 @@ fn vector_to_wire(vector: &Vector3<f64>) -> pb::Vector3 {
     }
 }
 
+impl pb::TrackUpdate {
+    /// The camera pose in the map frame; `None` if it is unknown.
+    pub fn map_from_camera(&self) -> Option<&pb::Pose> {
+        self.camera.as_ref()?.map_from_body()
+    }
+
+    /// The camera pose in the odometry frame.
+    pub fn odom_from_camera(&self) -> Option<&pb::Pose> {
+        self.camera.as_ref()?.odom_from_body()
+    }
+
+    /// The pose of the robot's base in the map frame; `None` without it, or if the map pose is
+    /// unknown.
+    pub fn map_from_base(&self) -> Option<&pb::Pose> {
+        self.base.as_ref()?.map_from_body()
+    }
+
+    /// The pose of the robot's base in the odometry frame; `None` without it.
+    pub fn odom_from_base(&self) -> Option<&pb::Pose> {
+        self.base.as_ref()?.odom_from_body()
+    }
+}
+
+impl pb::TrackedBody {
+    fn map_from_body(&self) -> Option<&pb::Pose> {
+        self.map_pose.as_ref()?.pose.as_ref()
+    }
+
+    fn odom_from_body(&self) -> Option<&pb::Pose> {
+        self.odom_pose.as_ref()?.pose.as_ref()
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

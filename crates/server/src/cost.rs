@@ -52,6 +52,11 @@ impl Costs<'_> {
         }
     }
 
+    /// Lane of a ListPairs request.
+    pub fn list_pairs(&self, room: &str) -> Lane {
+        lane(0, self.frame_count(room) as f64)
+    }
+
     /// Lane of a ListFrames request for `frames` frames. The neighbors of a frame are searched
     /// among all frames of the room.
     pub fn list_frames(&self, request: &pb::ListFramesRequest, frames: usize) -> Lane {
@@ -59,7 +64,7 @@ impl Costs<'_> {
             Some(_) => frames,
             None => 0,
         };
-        let neighbors = match request.neighbours_within {
+        let neighbors = match request.neighbors_within {
             Some(_) => frames as f64 * self.frame_count(&request.room) as f64,
             None => frames as f64,
         };
@@ -107,10 +112,10 @@ pub fn frame_bytes(room: &Room) -> usize {
 }
 
 /// Upper bound of the encoded size of a step without its frames, bytes.
-pub fn step_bytes(latent_dim: usize, thresholds: usize) -> usize {
-    /// The requested pose and its room's name, and the errors.
-    const POSE: usize = 260;
-    POSE + 8 * latent_dim + 16 * thresholds
+pub fn step_bytes(latent_dim: usize, adapter: &str) -> usize {
+    /// The requested pose and its room's name, the errors, and the adapter's revision.
+    const POSE: usize = 280;
+    POSE + 8 * latent_dim + adapter.len()
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 
 use tonic::{Request, Response, Status};
 
+use super::convert;
 use super::cost::lane;
 use super::embedding::RequestAdapter;
 use super::workers::{image_count, images_of};
@@ -35,7 +36,9 @@ fn answer(
 ) -> Result<pb::EncodeResponse, Error> {
     let pb::EncodeRequest {
         adapter,
+        adapter_revision: _,
         room,
+        room_revision: _,
         views,
         with_features,
     } = request;
@@ -47,7 +50,9 @@ fn answer(
         ));
     }
 
+    let adapter = convert::stated_adapter(&adapter, &views)?.to_owned();
     let chosen = RequestAdapter::of(snapshot, &room, &adapter)?;
+    let revision = convert::stored_revision(&chosen.stored);
     let embedder = chosen.embedder(snapshot);
     if image_count(&views) > 0 {
         let encoder = snapshot.image_encoder(&chosen.stored)?;
@@ -61,6 +66,7 @@ fn answer(
         encoded.push(pb::EncodedView {
             latent: Some(pb::Latent {
                 values: embedded.latent.to_vec(),
+                adapter: Some(revision.clone()),
             }),
             feature: embedded
                 .feature
@@ -73,10 +79,7 @@ fn answer(
     }
 
     Ok(pb::EncodeResponse {
-        adapter: Some(pb::Revision {
-            name: chosen.stored.name.clone(),
-            revision: chosen.stored.revision,
-        }),
+        adapter: Some(revision),
         views: encoded,
     })
 }

@@ -1,5 +1,6 @@
 //! EvaluationService: Hit@ε of the server's navigators or of a client's predictions.
 
+use std::collections::HashSet;
 use std::pin::Pin;
 use std::sync::Arc;
 
@@ -9,7 +10,9 @@ use tonic::{Request, Response, Status};
 use tracing::Instrument;
 
 use super::convert;
+use super::memory::hold_for_answer;
 use super::snapshot::{ServedNavigator, WantedPairs};
+use super::stated_revisions::StatesRevisions;
 use super::workers::{CallContext, Lane};
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
@@ -18,6 +21,7 @@ use seese3_core::cancel::Cancellation;
 use seese3_core::eval::{
     Leak, PredictionScope, Protocol, TrainedOn, evaluate, is_calibrated_in, score_predictions,
 };
+use seese3_core::splits::{Pair, Split};
 
 type Events = mpsc::Sender<Result<pb::EvaluateResponse, Status>>;
 
@@ -30,12 +34,14 @@ impl EvaluationService for Handlers {
         request: Request<pb::EvaluateRequest>,
     ) -> Result<Response<Self::EvaluateStream>, Status> {
         let snapshot = self.snapshot(&request)?;
+        let stated = request.get_ref().stated_revisions()?;
         let context = self.workers.context(&request);
         let most_steps = self.config.limits.steps;
         let request = request.into_inner();
         let (served, protocol) = self
             .workers
             .run(Lane::Short, context.clone(), move |_| {
+                let snapshot = snapshot.with_revisions(&stated)?;
                 protocol(&snapshot, request, most_steps)
             })
             .await?;
@@ -48,6 +54,18 @@ impl EvaluationService for Handlers {
         tokio::spawn(run.instrument(tracing::Span::current()));
 
         Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
+    }
+
+    async fn list_pairs(
+        &self,
+        request: Request<pb::ListPairsRequest>,
+    ) -> Result<Response<pb::ListPairsResponse>, Status> {
+        self.unary(
+            request,
+            |costs, request| costs.list_pairs(&request.room),
+            move |snapshot, request, _| list_pairs(snapshot, request),
+        )
+        .await
     }
 
     async fn score_predictions(
@@ -89,7 +107,7 @@ impl Handlers {
                 let _ = events.try_send(Ok(pb::EvaluateResponse { event: Some(event) }));
             })?;
 
-            Ok(report_to_wire(&served, &report))
+            Ok(report_to_wire(&served, report))
         };
 
         // If the caller closes the stream, `run` is dropped, which cancels the computation.
@@ -120,7 +138,9 @@ fn protocol(
 ) -> Result<(Arc<ServedNavigator>, Protocol), Error> {
     let pb::EvaluateRequest {
         room,
+        room_revision: _,
         adapter,
+        adapter_revision: _,
         stride,
         split,
         navigators,
@@ -129,11 +149,11 @@ fn protocol(
         thresholds,
         seed,
         steps,
-        mode,
+        step_mode,
     } = request;
 
     // The defaults are the adapter's split and stride: its test pairs were held out in training.
-    let split = convert::split(&split)?;
+    let split = convert::split(split)?;
     let served = snapshot.evaluated(&room, &adapter, WantedPairs { split, stride })?;
     let record = &served.adapter.record;
     let split = split.unwrap_or(record.split);
@@ -147,7 +167,7 @@ fn protocol(
         thresholds: convert::thresholds(thresholds)?,
         seed,
         steps: steps.unwrap_or(1),
-        mode: convert::mode_of(mode)?,
+        mode: convert::mode_of(step_mode)?,
         navigators,
     };
 
@@ -172,33 +192,92 @@ fn protocol(
 
 fn report_to_wire(
     served: &ServedNavigator,
-    report: &seese3_core::eval::Report,
+    report: seese3_core::eval::Report,
 ) -> pb::EvaluationReport {
     let record = &served.adapter.record;
+    let calibrated_here = is_calibrated_in(record, served.navigator.room().id());
+    let leak = Leak::of(record, served.trained_on, report.protocol.split);
+    let report = report.marked(leak, calibrated_here);
     let in_room = served.trained_on != TrainedOn::Nothing;
 
     pb::EvaluationReport {
         room: Some(convert::room_revision(served)),
         adapter: Some(convert::adapter_revision(served)),
-        split: report.protocol.split.name().to_owned(),
+        split: convert::split_to_wire(report.protocol.split).into(),
         stride: report.protocol.stride,
         n: report.n as u32,
         candidate_count: report.candidate_count as u32,
         source_excluded: report.protocol.exclude_source.is_some(),
         steps: report.protocol.steps,
-        mode: convert::mode_to_wire(report.protocol.mode).into(),
+        step_mode: convert::mode_to_wire(report.protocol.mode).into(),
         in_room,
-        leaks: Leak::of(record, served.trained_on, report.protocol.split).is_some(),
-        calibrated_here: is_calibrated_in(record, served.navigator.room().id()),
+        leaks: leak.is_some(),
+        calibrated_here,
         navigators: report.rows.iter().map(convert::row_to_wire).collect(),
     }
 }
 
-fn is_latent(prediction: &pb::Prediction) -> bool {
-    matches!(
-        prediction.prediction,
-        Some(pb::prediction::Prediction::Latent(_))
-    )
+fn list_pairs(
+    snapshot: &Snapshot,
+    request: pb::ListPairsRequest,
+) -> Result<pb::ListPairsResponse, Error> {
+    /// Upper bound of the encoded size of a frame's row, bytes.
+    const ROW_BYTES: usize = 5;
+
+    let pb::ListPairsRequest {
+        room,
+        room_revision: _,
+        split,
+        stride,
+        adapter,
+        adapter_revision: _,
+    } = request;
+
+    let split = convert::split(split)?;
+    let (split, stride) = match split.zip(stride) {
+        Some(stated) => stated,
+        None => {
+            let pairs = WantedPairs { split, stride };
+            let served = snapshot.evaluated(&room, &adapter, pairs)?;
+            let record = &served.adapter.record;
+            (
+                split.unwrap_or(record.split),
+                stride.unwrap_or(record.stride),
+            )
+        }
+    };
+
+    let served = snapshot.room(&room)?;
+    let loaded = served.load()?;
+    let timeline = loaded.room.timeline();
+    // Each frame is at most twice in the test pairs, twice in the training pairs and once a candidate.
+    hold_for_answer(5 * ROW_BYTES * loaded.room.frame_count())?;
+    let test = split.test_pairs(timeline, stride);
+    let test = test.map_err(|error| Error::invalid("stride", error))?;
+    let training = split.train_pairs(timeline, stride);
+    // A split without training pairs can still be tested.
+    let training = training.unwrap_or_default();
+
+    let sources = |pairs: &[Pair]| pairs.iter().map(|pair| pair.source.0).collect();
+    let targets = |pairs: &[Pair]| pairs.iter().map(|pair| pair.target.0).collect();
+    let candidates = split.candidates(timeline);
+    Ok(pb::ListPairsResponse {
+        room: Some(convert::served_revision(served)),
+        split: convert::split_to_wire(split).into(),
+        stride,
+        test_sources: sources(&test),
+        test_targets: targets(&test),
+        training_sources: sources(&training),
+        training_targets: targets(&training),
+        candidates: candidates.iter().map(|frame| frame.0).collect(),
+    })
+}
+
+fn latent_of(given: &pb::Prediction) -> Option<&pb::Latent> {
+    match &given.prediction {
+        Some(pb::prediction::Prediction::Latent(latent)) => Some(latent),
+        _ => None,
+    }
 }
 
 fn score(
@@ -209,7 +288,9 @@ fn score(
 ) -> Result<pb::ScorePredictionsResponse, Error> {
     let pb::ScorePredictionsRequest {
         room,
+        room_revision: _,
         adapter,
+        adapter_revision: _,
         predictions,
         split,
         exclude_source,
@@ -217,16 +298,16 @@ fn score(
         thresholds,
     } = request;
 
-    let split = convert::split(&split)?;
+    let split = convert::split(split)?;
     let pairs = WantedPairs {
         split,
         stride: None,
     };
-    let served = match snapshot.evaluated(&room, &adapter, pairs) {
+    let adapter = convert::adapter_of_latents(&adapter, predictions.iter().filter_map(latent_of))?;
+    let has_latents = predictions.iter().any(|given| latent_of(given).is_some());
+    let served = match snapshot.evaluated(&room, adapter, pairs) {
         // No latent of an adapter is compared.
-        Err(Error::Invalid { .. }) if !predictions.iter().any(is_latent) => {
-            snapshot.navigator(&room, &adapter)?
-        }
+        Err(Error::Invalid { .. }) if !has_latents => snapshot.navigator(&room, adapter)?,
         served => served?,
     };
 
@@ -236,6 +317,17 @@ fn score(
             predictions.len()
         );
         return Err(Error::invalid("predictions", problem));
+    }
+
+    let mut pairs = HashSet::new();
+    for (position, given) in predictions.iter().enumerate() {
+        if !pairs.insert((given.source_frame_id, given.target_frame_id)) {
+            let problem = format!(
+                "is of the pair ({}, {}), which is predicted twice",
+                given.source_frame_id, given.target_frame_id
+            );
+            return Err(Error::invalid(format!("predictions[{position}]"), problem));
+        }
     }
 
     let scope = PredictionScope {
@@ -249,9 +341,13 @@ fn score(
     let predictions = predictions
         .into_iter()
         .enumerate()
-        .map(|(position, given)| convert::prediction(position, given))
+        .map(|(position, given)| convert::prediction(position, given, &served.adapter))
         .collect::<Result<Vec<_>, _>>()?;
-    let row = score_predictions(&served.navigator, &predictions, &scope, cancel)?;
+    let mut row = score_predictions(&served.navigator, &predictions, &scope, cancel)?;
+    // Without a split, any pair may be one of the training.
+    let split = scope.split.unwrap_or(Split::Whole);
+    let leak = Leak::of(&served.adapter.record, served.trained_on, split);
+    row.leaks = has_latents && leak.is_some();
 
     // Without a split, every frame of the room is a candidate.
     let frame_count = served.navigator.room().frame_count();
@@ -264,5 +360,6 @@ fn score(
         adapter: Some(convert::adapter_revision(&served)),
         scores: Some(convert::row_to_wire(&row)),
         candidate_count: candidate_count as u32,
+        leaks: row.leaks,
     })
 }

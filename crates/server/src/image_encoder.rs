@@ -30,6 +30,11 @@ pub struct ImageEncoders {
 impl ImageEncoders {
     /// Default of `request_pixels`: 256 images of 1280 × 720 pixels, or 16 of 16 million.
     pub const REQUEST_PIXELS: u64 = 1 << 28;
+
+    /// The largest number of pixels of one image.
+    pub fn pixels(&self) -> u64 {
+        self.bounds.pixels
+    }
 }
 
 /// Encodes images for one adapter.

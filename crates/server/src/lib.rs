@@ -41,6 +41,7 @@ mod workers;
 mod memory;
 mod telemetry;
 mod two_views;
+mod stated_revisions;
 mod snapshot;
 mod convert;
 mod cost;
@@ -48,9 +49,9 @@ mod embedding;
 mod image_view;
 mod reload;
 mod catalog;
-mod evaluation;
 mod localization;
-mod navigate_to;
+mod evaluation;
+mod plan_route;
 mod navigation;
 mod relocalization;
 mod track;
@@ -105,6 +106,7 @@ use seese3_core::navigation::{IndexKind, Limits};
 use seese3_store::Store;
 use shares::Shares;
 use snapshot::Loader;
+use stated_revisions::StatesRevisions;
 use workers::{Lane, Workers};
 
 /// Maximum number of blocking threads that a server may need, of tokio's runtime
@@ -308,10 +310,11 @@ impl Handlers {
         work: impl FnOnce(&Snapshot, Q, &Cancellation) -> Result<A, Error> + Send + 'static,
     ) -> Result<Response<A>, Status>
     where
-        Q: Send + 'static,
+        Q: StatesRevisions + Send + 'static,
         A: Message + 'static,
     {
         let snapshot = self.snapshot(&request)?;
+        let stated = request.get_ref().stated_revisions()?;
         let context = self.workers.context(&request);
         let request = request.into_inner();
         let costs = Costs {
@@ -320,7 +323,10 @@ impl Handlers {
         };
         let lane = lane(&costs, &request);
 
-        let work = move |cancel: &Cancellation| work(&snapshot, request, cancel);
+        let work = move |cancel: &Cancellation| {
+            let snapshot = snapshot.with_revisions(&stated)?;
+            work(&snapshot, request, cancel)
+        };
         respond(self.workers.run(lane, context, with_lease(work)).await?)
     }
 }

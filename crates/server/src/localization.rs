@@ -18,7 +18,7 @@ use seese3_core::keypoints::KeypointSource;
 use seese3_core::localization::{Place, localize};
 use seese3_core::navigation::{Error as E, Source, Start, StepError};
 use seese3_core::room::{self, RoomId};
-use seese3_robot::fitting::RoomReader;
+use seese3_robot::fitting::{MotionReader, RoomReader};
 use seese3_robot::localization::{
     AdapterLocalizer, LocatedView, Method, NotInRoom, NotLocated, PoseEstimate,
 };
@@ -46,8 +46,8 @@ impl LocalizationService for Handlers {
             )
             .await?;
 
-        let place = response.get_ref().places.first();
-        if let Some(frame) = place.and_then(|place| place.frame.as_ref()) {
+        let first = response.get_ref().frames.first();
+        if let Some(frame) = first.and_then(|first| first.frame.as_ref()) {
             self.config.metrics.retrieved(frame.distance);
         }
 
@@ -63,14 +63,15 @@ fn answer(
 ) -> Result<pb::LocalizeResponse, Error> {
     let pb::LocalizeRequest {
         rooms,
+        room_revisions: _,
         adapter,
+        adapter_revision: _,
         view,
         top_k,
-        thresholds,
         camera,
     } = request;
 
-    let thresholds = convert::thresholds(thresholds)?;
+    let adapter = convert::stated_adapter(&adapter, &view)?.to_owned();
     let k = checked_count(top_k, most)?;
 
     // First match keypoints, which needs no adapter.
@@ -99,7 +100,7 @@ fn answer(
     let mut response = match &retrieved {
         Some(retrieved) => pb::LocalizeResponse {
             adapter: Some(convert::adapter_revision(&retrieved.served[0])),
-            places: retrieved.places_to_wire(&thresholds)?,
+            frames: retrieved.frames_to_wire()?,
             ..Default::default()
         },
         None => pb::LocalizeResponse::default(),
@@ -233,18 +234,18 @@ impl Retrieved {
         }
     }
 
-    fn places_to_wire(&self, thresholds: &[f64]) -> Result<Vec<pb::Place>, Error> {
+    fn frames_to_wire(&self) -> Result<Vec<pb::SimilarFrame>, Error> {
         let place = |place: &Place| {
             let served = self.navigator_of(&place.room)?;
             let room = served.navigator.room();
-            Ok(pb::Place {
+            Ok(pb::SimilarFrame {
                 room: Some(convert::room_revision(served)),
                 frame: Some(convert::retrieved_to_wire(&place.frame, room)),
                 // The source of the error is the true pose itself, so its twist is
                 // log(true⁻¹ · found).
                 error: self.start.pose.map(|truth| {
                     let error = StepError::of(&truth, &place.frame.pose, &truth);
-                    convert::error_to_wire(&error, thresholds)
+                    convert::error_to_wire(&error)
                 }),
             })
         };
@@ -261,7 +262,7 @@ fn fill_pose(
 ) -> Result<(), Error> {
     if !matches.located.is_empty() {
         let (room, view) = matches.located.swap_remove(0);
-        response.room = Some(room_to_wire(&room));
+        response.room = Some(convert::served_revision(&room));
         let estimate = PoseEstimate::choose(Some(Ok(view)), || None);
         LocatedPose::of(estimate, room.id.as_str()).fill(response);
         return Ok(());
@@ -270,7 +271,7 @@ fn fill_pose(
     let Some(retrieved) = retrieved else {
         // Only keypoints were compared, with at least one room.
         let (room, why) = matches.unmatched.first().ok_or(Error::Internal)?;
-        response.room = Some(room_to_wire(room));
+        response.room = Some(convert::served_revision(room));
         let estimate = PoseEstimate::choose(Some(Err(*why)), || None);
         LocatedPose::of(estimate, room.id.as_str()).fill(response);
         return Ok(());
@@ -321,13 +322,6 @@ pub(super) fn localizer(served: &ServedNavigator) -> AdapterLocalizer<'_> {
         navigator: &served.navigator,
         map: served.map.as_deref(),
         reader: served.room_reader().map(|reader| reader as &dyn PoseReader),
-    }
-}
-
-pub(super) fn room_to_wire(room: &ServedRoom) -> pb::Revision {
-    pb::Revision {
-        name: room.id.to_string(),
-        revision: room.summary.revision,
     }
 }
 
@@ -439,11 +433,19 @@ fn fitted_to_wire(reader: &RoomReader, feature: &[f32]) -> Result<pb::FittedEsti
     Ok(pb::FittedEstimate {
         frame_id: view.nearest.frame.0,
         distance: view.nearest.distance,
-        translation_reader: view.translation.reader.to_string(),
+        translation_estimator: estimator_to_wire(view.translation.reader).into(),
         translation_gain: view.translation.gain,
-        rotation_reader: view.rotation.reader.to_string(),
+        rotation_estimator: estimator_to_wire(view.rotation.reader).into(),
         rotation_gain: view.rotation.gain,
     })
+}
+
+fn estimator_to_wire(reader: MotionReader) -> pb::RelativeEstimator {
+    match reader {
+        MotionReader::Fitted => pb::RelativeEstimator::Fitted,
+        MotionReader::ZeroShot => pb::RelativeEstimator::ZeroShot,
+        MotionReader::NearestFrame => pb::RelativeEstimator::NearestFrame,
+    }
 }
 
 /// The number of frames to return.

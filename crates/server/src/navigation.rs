@@ -1,4 +1,4 @@
-//! NavigationService: Navigate and BatchNavigate. NavigateTo is in `navigate_to`.
+//! NavigationService: Navigate and BatchNavigate. PlanRoute is in `plan_route`.
 
 use tonic::{Request, Response, Status};
 
@@ -6,13 +6,11 @@ use super::convert;
 use super::cost::{frame_bytes, step_bytes, step_count};
 use super::memory::hold_for_answer;
 use super::snapshot::ServedNavigator;
-use super::status::brief;
 use super::workers::{Lane, image_count, images_of};
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::navigation_service_server::NavigationService;
 use seese3_core::cancel::Cancellation;
-use seese3_core::eval::default_thresholds;
 use seese3_core::navigation::Limits;
 
 #[tonic::async_trait]
@@ -38,13 +36,11 @@ impl NavigationService for Handlers {
         Ok(response)
     }
 
-    type NavigateToStream = super::navigate_to::Events;
-
-    async fn navigate_to(
+    async fn plan_route(
         &self,
-        request: Request<pb::NavigateToRequest>,
-    ) -> Result<Response<Self::NavigateToStream>, Status> {
-        Ok(Response::new(self.begin_pursuit(request).await?))
+        request: Request<pb::PlanRouteRequest>,
+    ) -> Result<Response<pb::Route>, Status> {
+        self.planned_route(request).await
     }
 
     async fn batch_navigate(
@@ -112,11 +108,10 @@ fn answer_bytes(served: &ServedNavigator, request: &pb::NavigateRequest, limits:
     let steps = step_count(request).min(u64::from(limits.steps)) as usize;
     let frames = frames_requested(request).min(limits.frames_in_answer) as usize;
     let room = served.navigator.room();
-    let thresholds = request.thresholds.len().max(default_thresholds().len());
 
     let latent_dim = served.adapter.adapter.latent_dim();
     let of_frames = frames.saturating_mul(frame_bytes(room));
-    of_frames.saturating_add(steps.saturating_mul(step_bytes(latent_dim, thresholds)))
+    of_frames.saturating_add(steps.saturating_mul(step_bytes(latent_dim, &served.adapter.name)))
 }
 
 fn answer_batch(
@@ -133,10 +128,7 @@ fn answer_batch(
             Ok(response) => pb::batch_navigate_result::Result::Response(response),
             // Cancellation ends the batch; any other error fails only its own request.
             Err(Error::Cancelled) => return Err(Error::Cancelled),
-            Err(error) => pb::batch_navigate_result::Result::Failure(pb::Failure {
-                code: error.code().into(),
-                message: brief(&error.to_string()),
-            }),
+            Err(error) => pb::batch_navigate_result::Result::Error(error.into()),
         };
         results.push(pb::BatchNavigateResult {
             result: Some(result),
@@ -158,24 +150,26 @@ fn navigate(
     limits: Limits,
     cancel: &Cancellation,
 ) -> Result<pb::NavigateResponse, Error> {
-    let served = snapshot.navigator(&request.room, &request.adapter)?;
+    let adapter = convert::stated_adapter(&request.adapter, &request.source)?;
+    let served = snapshot.navigator(&request.room, adapter)?;
     hold_for_answer(answer_bytes(&served, &request, limits))?;
-    let (query, thresholds) = convert::query(request, &served.adapter, snapshot)?;
+    let query = convert::query(request, &served.adapter, snapshot)?;
     let answer = served.navigator.answer(&query, limits, cancel)?;
 
-    // The answer states the mode, reading and navigator in effect, including defaults. An index
+    // The answer states the step mode, variant and navigator in effect, including defaults. An index
     // without an audit is the exact scan.
     let room = served.navigator.room();
+    let adapter = convert::adapter_revision(&served);
 
     Ok(pb::NavigateResponse {
         room: Some(convert::room_revision(&served)),
-        adapter: Some(convert::adapter_revision(&served)),
         steps: (1..)
             .zip(&answer.steps)
-            .map(|(number, step)| convert::step_to_wire(number, step, room, &thresholds))
+            .map(|(number, step)| convert::step_to_wire(number, step, room, &adapter))
             .collect(),
-        mode: convert::mode_to_wire(query.mode).into(),
-        reading: convert::reading_to_wire(query.step).into(),
+        adapter: Some(adapter.clone()),
+        step_mode: convert::mode_to_wire(query.mode).into(),
+        inverse_variant: convert::variant_to_wire(query.step).into(),
         navigator: convert::navigator_to_wire(&query),
         displacement: answer
             .displacement

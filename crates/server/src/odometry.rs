@@ -52,9 +52,6 @@ fn answer(
     request: pb::EstimateMotionRequest,
     cancel: &Cancellation,
 ) -> Result<pb::EstimateMotionResponse, Error> {
-    // Check the thresholds for both estimators.
-    convert::thresholds(request.thresholds.clone())?;
-
     if let Some(answer) = by_two_views(snapshot, &request, cancel)? {
         return Ok(answer);
     }
@@ -82,15 +79,16 @@ fn by_adapter(
 ) -> Result<pb::EstimateMotionResponse, Error> {
     let pb::EstimateMotionRequest {
         adapter,
+        adapter_revision: _,
         room,
+        room_revision: _,
         first,
         second,
-        thresholds,
         camera: _,
     } = request;
 
-    let thresholds = convert::thresholds(thresholds)?;
-
+    let views = first.iter().chain(&second);
+    let adapter = convert::stated_adapter(&adapter, views)?.to_owned();
     let chosen = RequestAdapter::of(snapshot, &room, &adapter)?;
     let embedder = chosen.embedder(snapshot);
     let stored = chosen.stored.clone();
@@ -127,18 +125,11 @@ fn by_adapter(
             .map(|(first, second)| convert::twist_to_wire(&body_twist(first, second))),
         // The estimate as a pose: world_from_second = world_from_first · exp(motion).
         error: truth.map(|(first, second)| {
-            convert::error_to_wire(
-                &StepError::of(first, &(first * exp(&twist)), second),
-                &thresholds,
-            )
+            convert::error_to_wire(&StepError::of(first, &(first * exp(&twist)), second))
         }),
-        adapter: Some(pb::Revision {
-            name: stored.name.clone(),
-            revision: stored.revision,
-        }),
-        motion: Some(convert::twist_to_wire(&twist)),
-        reader: pb::MotionReader::Adapter.into(),
-        covariance: Vec::new(),
+        adapter: Some(convert::stored_revision(&stored)),
+        motion: Some(convert::motion_to_wire(&twist, None)),
+        estimator: pb::MotionEstimator::Adapter.into(),
     })
 }
 
@@ -178,19 +169,21 @@ fn by_two_views(
     };
 
     let estimate = two_views::estimate(encoder, [first, second], &camera, cancel)?;
-    let reader = if estimate.is_estimated {
-        pb::MotionReader::TwoView
+    let estimator = if estimate.is_estimated {
+        pb::MotionEstimator::TwoView
     } else {
-        pb::MotionReader::None
+        pb::MotionEstimator::None
     };
 
     Ok(Some(pb::EstimateMotionResponse {
         adapter: None,
-        motion: Some(convert::twist_to_wire(&estimate.twist())),
+        motion: Some(convert::motion_to_wire(
+            &estimate.twist(),
+            Some(&estimate.twist_covariance()),
+        )),
         true_motion: None,
         error: None,
-        reader: reader.into(),
-        covariance: convert::matrix_to_wire(&estimate.covariance),
+        estimator: estimator.into(),
     }))
 }
 

@@ -8,7 +8,7 @@ use tonic::{Request, Response, Status};
 use super::convert;
 use super::embedding::{EmbeddedView, StoredFrames, ViewEmbedder};
 use super::image_view::{ImageView, RoomMatches, Searched, ViewFields};
-use super::localization::{self, LocatedPose, asked_rooms, localizer, rooms_or_only, rooms_under};
+use super::localization::{LocatedPose, asked_rooms, localizer, rooms_or_only, rooms_under};
 use super::snapshot::{ServedNavigator, ServedRoom, Snapshot};
 use super::workers::{image_count, images_of};
 use super::{Error, Handlers};
@@ -50,7 +50,9 @@ fn answer(
 ) -> Result<pb::RelocalizeResponse, Error> {
     let pb::RelocalizeRequest {
         rooms,
+        room_revisions: _,
         adapter,
+        adapter_revision: _,
         views,
         max_rooms,
         top_k,
@@ -75,6 +77,8 @@ fn answer(
             format!("must be 1 to {MAX_VIEWS}, got {}", views.len()),
         ));
     }
+
+    let adapter = convert::stated_adapter(&adapter, &views)?.to_owned();
 
     // The keypoints of the newest view need no adapter.
     let asked = asked_rooms(snapshot, &rooms)?;
@@ -189,7 +193,7 @@ fn ranked(
     }
 
     for (room, why) in &matches.unmatched {
-        let revision = localization::room_to_wire(room);
+        let revision = convert::served_revision(room);
         if !rooms
             .iter()
             .any(|known| known.room.as_ref() == Some(&revision))
@@ -385,7 +389,7 @@ pub fn maps(served: &[Arc<ServedNavigator>]) -> Result<Vec<Arc<Map>>, Error> {
 fn located_to_wire((room, view): &(Arc<ServedRoom>, LocatedView)) -> pb::RoomMatch {
     let estimate = PoseEstimate::choose(Some(Ok(view.clone())), || None);
     let located = LocatedPose::of(estimate, room.id.as_str());
-    match_to_wire(localization::room_to_wire(room), located)
+    match_to_wire(convert::served_revision(room), located)
 }
 
 fn match_to_wire(room: pb::Revision, located: LocatedPose) -> pb::RoomMatch {

@@ -69,7 +69,7 @@ mod tests {
     fn streams_are_known_by_their_paths() {
         for (path, expected) in [
             ("/seese3.v1.OdometryService/Track", true),
-            ("/seese3.v1.CatalogService/CreateRoom", true),
+            ("/seese3.v1.CatalogService/UploadRoom", true),
             ("/seese3.v1.NavigationService/Navigate", false),
             ("/seese3.v1.EvaluationService/Evaluate", false),
             (

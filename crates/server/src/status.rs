@@ -1,5 +1,6 @@
 //! Errors as gRPC statuses. This is the only place where status codes are chosen.
 
+use prost::Message;
 use strum::{Display, IntoStaticStr, VariantArray};
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
@@ -103,6 +104,9 @@ pub enum Error {
     #[strum(serialize = "BUSY")]
     Full { what: Full },
     #[error("{problem}")]
+    #[strum(serialize = "ALREADY_EXISTS")]
+    Exists { field: String, problem: String },
+    #[error("{problem}")]
     Quota { problem: String },
     #[error("this server has no such RPC")]
     #[strum(serialize = "UNKNOWN_RPC")]
@@ -163,6 +167,15 @@ impl Error {
         }
     }
 
+    /// An error for a revision that the store does not have.
+    pub fn no_revision(field: &str, name: &str, revision: u64) -> Self {
+        Self::NotFound {
+            field: field.to_owned(),
+            name: format!("{name}' revision '{revision}"),
+            nearest: None,
+        }
+    }
+
     /// The same error with its field prefixed by the field that contains it.
     pub fn within(self, parent: &str) -> Self {
         match self {
@@ -209,6 +222,7 @@ impl Error {
             Self::Invalid { .. } => Code::InvalidArgument,
             Self::NotFound { .. } | Self::NotStored { .. } => Code::NotFound,
             Self::Precondition(_) | Self::Quota { .. } => Code::FailedPrecondition,
+            Self::Exists { .. } => Code::AlreadyExists,
             Self::Conflict { .. } => Code::Aborted,
             Self::Transport { code, .. } => *code,
             Self::Loading => Code::Unavailable,
@@ -225,6 +239,19 @@ impl Error {
 
 fn meant(nearest: Option<&String>) -> String {
     nearest.map_or_else(String::new, |name| format!("; did you mean '{name}'?"))
+}
+
+impl From<Error> for tonic_types::Status {
+    /// The status of one request of a batch, with the details that the request alone would get.
+    fn from(error: Error) -> Self {
+        let status = Status::from(error);
+        // The details are those that the conversion above encodes.
+        Self::decode(status.details()).unwrap_or_else(|_| Self {
+            code: status.code().into(),
+            message: status.message().to_owned(),
+            details: Vec::new(),
+        })
+    }
 }
 
 impl From<Error> for Status {
@@ -249,6 +276,9 @@ impl From<Error> for Status {
             }
             Error::NotStored { field, name } => {
                 details.set_resource_info(brief(field), brief(name), "", "is not in the store");
+            }
+            Error::Exists { field, problem } => {
+                details.set_resource_info(brief(field), "", "", brief(problem));
             }
             Error::Full { .. } => {
                 details.set_retry_info(Some(std::time::Duration::from_millis(500)));
@@ -413,6 +443,13 @@ mod tests {
                     what: Full::Streams,
                 },
                 "RESOURCE_EXHAUSTED",
+            ),
+            (
+                Error::Exists {
+                    field: name(),
+                    problem: name(),
+                },
+                "ALREADY_EXISTS",
             ),
             (Error::Quota { problem: name() }, "FAILED_PRECONDITION"),
             (Error::UnknownPath, "UNIMPLEMENTED"),

@@ -8,7 +8,7 @@ use super::adapter_files::{
 };
 use super::format::{AdapterBody, FittedEntry, TrainingEntry};
 use super::manifest::{self, ObjectRef, SCHEMA};
-use super::publication::Publication;
+use super::publication::{Publication, UploadPolicy};
 use super::stored_adapter::{RoomFit, StoredAdapter};
 use super::{
     ATTEMPTS, Defaults, Error, Kind, Published, Store, folder_of, gone_name, revision_path,
@@ -114,7 +114,7 @@ impl Store {
             created: String::new(),
             weights: ObjectRef::default(),
         };
-        self.publish_body(name, body, bytes).await
+        self.publish_body(name, body, bytes, None).await
     }
 
     /// Publishes a manifest and its weights under a name. Sets the name, revision, date and weights
@@ -124,6 +124,7 @@ impl Store {
         name: &str,
         body: AdapterBody,
         weights: Vec<u8>,
+        policy: Option<UploadPolicy>,
     ) -> Result<Published, Error> {
         let folder = folder_of(Kind::Adapter, name);
 
@@ -166,6 +167,11 @@ impl Store {
                     publication.check(&unchanged.manifest)?;
                 }
                 return Ok(unchanged);
+            }
+            if let Some(policy) = policy {
+                let newest = newest.as_ref().map(|newest| newest.revision);
+                self.check_policy(Kind::Adapter, name, newest, policy)
+                    .await?;
             }
 
             let manifest = revision_path(&folder, body.revision).to_string();
@@ -223,12 +229,14 @@ impl Store {
     ///
     /// # Errors
     /// [`Error::Damaged`] if the manifest or the weights are truncated, altered or do not belong
-    /// together, otherwise as [`Store::publish_adapter`].
-    pub async fn publish_adapter_files(
+    /// together, [`Error::Exists`] or [`Error::Unknown`] if the adapter does not satisfy `policy`,
+    /// otherwise as [`Store::publish_adapter`].
+    pub async fn upload_adapter_files(
         &self,
         name: &str,
         manifest: &[u8],
         weights: Vec<u8>,
+        policy: UploadPolicy,
     ) -> Result<Published, Error> {
         if !is_plain_name(name) {
             return Err(Error::Name {
@@ -239,7 +247,22 @@ impl Store {
 
         check_adapter_files(manifest, &weights)?;
         let body = manifest::decode(UPLOADED_MANIFEST, manifest)?;
-        self.publish_body(name, body, weights).await
+        self.publish_body(name, body, weights, Some(policy)).await
+    }
+
+    /// Checks the condition of an upload, without writing. Whether the content is the same is not
+    /// checked: an adapter that exists can only be replaced.
+    ///
+    /// # Errors
+    /// As [`Store::upload_adapter_files`].
+    pub async fn check_adapter_upload(
+        &self,
+        name: &str,
+        policy: UploadPolicy,
+    ) -> Result<(), Error> {
+        let folder = folder_of(Kind::Adapter, name);
+        let newest = self.revisions(&folder).await?.present.last().copied();
+        self.check_policy(Kind::Adapter, name, newest, policy).await
     }
 
     /// The manifest and weights files of an adapter, for publishing in another store.

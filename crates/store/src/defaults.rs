@@ -73,8 +73,32 @@ pub enum Choice {
         /// The name of the adapter.
         adapter: String,
     },
-    /// Clears the defaults of this room or adapter.
+    /// Clears all defaults of this room or adapter.
     Nothing(ResourceName),
+    /// Clears one default.
+    Cleared(Cleared),
+}
+
+/// A default that is cleared.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Cleared {
+    /// The default revision of a room or an adapter. The resource name has no revision.
+    RevisionOf(ResourceName),
+    /// The default adapter of a room.
+    AdapterOf {
+        /// The name of the room.
+        room: String,
+    },
+}
+
+impl Cleared {
+    /// The room or adapter.
+    pub fn resource(&self) -> ResourceName {
+        match self {
+            Self::RevisionOf(resource) => resource.clone(),
+            Self::AdapterOf { room } => ResourceName::room(room),
+        }
+    }
 }
 
 impl Defaults {
@@ -186,6 +210,12 @@ impl Defaults {
                     changed.adapters.remove(&resource.name);
                 }
             }
+            Choice::Cleared(Cleared::RevisionOf(resource)) => {
+                revisions(&mut changed, resource.kind, &resource.name, None);
+            }
+            Choice::Cleared(Cleared::AdapterOf { room }) => {
+                changed.adapters.remove(room);
+            }
         }
 
         changed
@@ -241,7 +271,7 @@ impl Store {
                 self.check_exists(&ResourceName::room(room)).await?;
                 self.check_exists(&ResourceName::adapter(adapter)).await
             }
-            Choice::Nothing(_) => Ok(()),
+            Choice::Nothing(_) | Choice::Cleared(_) => Ok(()),
         }
     }
 

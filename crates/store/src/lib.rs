@@ -63,11 +63,11 @@ pub mod adapter_choice;
 pub use adapter_files::{check_adapter_files, stated_weights_size};
 
 pub use contents::{Contents, RevisionContents, Usage};
-pub use defaults::{Choice, Defaults, StandingDefaults};
+pub use defaults::{Choice, Cleared, Defaults, StandingDefaults};
 pub use extension::{ExtendedRoom, OtherFeatures};
 pub use garbage::{Garbage, GarbageFile, GarbagePolicy, Publishers};
 pub use map_edits::EditedRoom;
-pub use publication::{Clock, GRACE, LONGEST_PUBLICATION};
+pub use publication::{Clock, GRACE, LONGEST_PUBLICATION, UploadPolicy};
 pub use quota::{Quota, Quotas, Scope};
 pub use removal::Removed;
 pub use resource::{Kind, ResourceName, ResourceNameError};
@@ -126,6 +126,16 @@ pub enum Error {
          are free again after garbage collection"
     )]
     Quota { used: String },
+    #[error(
+        "{kind} '{name}' exists in revision {revision} with other content; upload under another name, or state \
+         that it is to be replaced{}",
+        if *kind == "room" { " or extended" } else { "" }
+    )]
+    Exists {
+        kind: &'static str,
+        name: String,
+        revision: u64,
+    },
     #[error("{kind} '{name}' has no revision {revision}; its newest is {newest}")]
     UnknownRevision {
         kind: &'static str,

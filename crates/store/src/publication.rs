@@ -16,7 +16,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::{Error, Store};
+use super::{Error, Kind, Store};
 
 /// Minimum age of files that garbage collection removes.
 pub const GRACE: Duration = Duration::from_secs(3_600);
@@ -49,6 +49,44 @@ impl Default for Clock {
 impl fmt::Debug for Clock {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         formatter.write_str("Clock")
+    }
+}
+
+/// What an upload may change. The same content again is always accepted and changes nothing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum UploadPolicy {
+    /// Creates a room or an adapter; one of this name must not exist.
+    Create,
+    /// Publishes a new revision of a room or an adapter that exists.
+    Replace,
+}
+
+impl Store {
+    /// Checks the condition of an upload that is not the same content again. `newest` is the newest
+    /// revision of the room or adapter.
+    ///
+    /// # Errors
+    /// [`Error::Exists`] or [`Error::Unknown`].
+    pub(super) async fn check_policy(
+        &self,
+        kind: Kind,
+        name: &str,
+        newest: Option<u64>,
+        policy: UploadPolicy,
+    ) -> Result<(), Error> {
+        match (policy, newest) {
+            (UploadPolicy::Create, None) | (UploadPolicy::Replace, Some(_)) => Ok(()),
+            (UploadPolicy::Create, Some(revision)) => Err(Error::Exists {
+                kind: kind.into(),
+                name: name.to_owned(),
+                revision,
+            }),
+            (UploadPolicy::Replace, None) => Err(Error::Unknown {
+                kind: kind.into(),
+                name: name.to_owned(),
+                known: self.names(kind).await?,
+            }),
+        }
     }
 }
 

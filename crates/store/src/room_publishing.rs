@@ -4,7 +4,7 @@ use object_store::path::Path;
 
 use super::format::{FeaturesEntry, RoomBody};
 use super::manifest::{self, ObjectRef, SCHEMA};
-use super::publication::Publication;
+use super::publication::{Publication, UploadPolicy};
 use super::room_files::{features_file, frames_file, names_file, read_frames};
 use super::room_keypoints::{KeypointsEntry, RoomKeypoints};
 use super::{ATTEMPTS, Error, Kind, Published, Store, folder_of, revision_path};
@@ -51,6 +51,8 @@ pub(super) enum PublishPolicy {
     SameFrames,
     /// The newest revision has this number.
     Revision(u64),
+    /// The condition of an upload.
+    Upload(UploadPolicy),
 }
 
 /// The body of a new revision's manifest.
@@ -144,6 +146,38 @@ impl Store {
     /// otherwise as [`Store::publish_room`].
     pub async fn publish_contents(&self, contents: RoomContents<'_>) -> Result<Published, Error> {
         self.publish_over(contents, PublishPolicy::AnyFrames).await
+    }
+
+    /// Publishes an uploaded room, like [`Store::publish_contents`], under the condition `policy`.
+    ///
+    /// # Errors
+    /// [`Error::Exists`] or [`Error::Unknown`] if the room does not satisfy `policy`; otherwise as
+    /// [`Store::publish_contents`].
+    pub async fn upload_contents(
+        &self,
+        contents: RoomContents<'_>,
+        policy: UploadPolicy,
+    ) -> Result<Published, Error> {
+        self.publish_over(contents, PublishPolicy::Upload(policy))
+            .await
+    }
+
+    /// Checks the condition of an upload, without writing. The same frames count as the same
+    /// content.
+    ///
+    /// # Errors
+    /// As [`Store::upload_contents`].
+    pub async fn check_upload(&self, room: &Room, policy: UploadPolicy) -> Result<(), Error> {
+        let name = room.id().as_str();
+        let folder = folder_of(Kind::Room, name);
+        let newest = self.revisions(&folder).await?.present.last().copied();
+        if let (UploadPolicy::Create, Some(revision)) = (policy, newest) {
+            let body = self.room_body(&folder, revision).await?;
+            if self.has_poses(&folder, &body, room).await? {
+                return Ok(());
+            }
+        }
+        self.check_policy(Kind::Room, name, newest, policy).await
     }
 
     /// Publishes a room like [`Store::publish_room`], but not over a newest revision with different
@@ -296,21 +330,20 @@ impl Store {
                 .sort_by(|a, b| a.source.name.cmp(&b.source.name));
 
             if let Some(unchanged) = unchanged(&folder, &body, newest) {
-                // At a quota, a missing object was not written again.
-                if self.lacks(&folder, body.objects()).await? {
-                    publication.check(&unchanged.manifest)?;
-                }
+                self.check_stored(&publication, &folder, &body, &unchanged)
+                    .await?;
                 return Ok(unchanged);
+            }
+            if let PublishPolicy::Upload(policy) = over {
+                let name = room.id().as_str();
+                self.check_policy(Kind::Room, name, newest_revision, policy)
+                    .await?;
             }
 
             let manifest = revision_path(&folder, body.revision).to_string();
+            let bytes = manifest::encode(&manifest, &body)?;
             if self
-                .write_manifest(
-                    &publication,
-                    &folder,
-                    body.revision,
-                    manifest::encode(&manifest, &body)?,
-                )
+                .write_manifest(&publication, &folder, body.revision, bytes)
                 .await?
             {
                 if !self
@@ -330,6 +363,21 @@ impl Store {
         Err(Error::Contended {
             name: room.id().to_string(),
         })
+    }
+
+    /// Checks a publication whose content is stored already. At a quota, a missing object was not
+    /// written again.
+    async fn check_stored(
+        &self,
+        publication: &Publication,
+        folder: &Path,
+        body: &RoomBody,
+        unchanged: &Published,
+    ) -> Result<(), Error> {
+        if self.lacks(folder, body.objects()).await? {
+            publication.check(&unchanged.manifest)?;
+        }
+        Ok(())
     }
 
     /// Adds to a new manifest what the newest revision has and the publication lacks: parameters of

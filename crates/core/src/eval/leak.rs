@@ -1,7 +1,9 @@
 //! Data leakage: whether an adapter may have been trained on its test pairs. Commands, the service
 //! and reports all use this check.
 
+use super::navigators::Report;
 use crate::adapter::TrainingRecord;
+use crate::navigation::{NavigatorKind, RetrievalMetric};
 use crate::room::RoomId;
 use crate::splits::Split;
 
@@ -50,4 +52,25 @@ pub fn is_calibrated_in(record: &TrainingRecord, room: &RoomId) -> bool {
 /// Whether the adapter was trained or calibrated in a room.
 pub fn has_seen(record: &TrainingRecord, room: &RoomId) -> bool {
     record.rooms.iter().any(|(name, _)| name == room) || is_calibrated_in(record, room)
+}
+
+impl Report {
+    /// This report with its leaking rows marked. With a `leak`, the rows of all navigators that use
+    /// the adapter leak; the baselines do not use it. If the adapter was calibrated in the room, the
+    /// rows of calibrated navigators leak.
+    #[must_use]
+    pub fn marked(mut self, leak: Option<Leak>, is_calibrated_here: bool) -> Self {
+        for row in &mut self.rows {
+            row.leaks = match NavigatorKind::from_name(&row.name) {
+                Some(NavigatorKind::Identity | NavigatorKind::Random | NavigatorKind::Oracle) => {
+                    false
+                }
+                Some(NavigatorKind::Step(_, RetrievalMetric::Calibrated)) => {
+                    leak.is_some() || is_calibrated_here
+                }
+                Some(NavigatorKind::Step(..)) | None => leak.is_some(),
+            };
+        }
+        self
+    }
 }

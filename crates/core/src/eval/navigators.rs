@@ -110,6 +110,18 @@ pub struct Row {
     pub latent: Option<LatentScores>,
     /// Scores of the retrieved frames.
     pub retrieval: RetrievalScores,
+    /// Whether these are no held-out scores; set by [`Report::marked`].
+    pub leaks: bool,
+}
+
+impl Row {
+    /// The name, followed by LEAK if the scores are no held-out scores.
+    pub fn label(&self) -> String {
+        match self.leaks {
+            true => format!("{} LEAK", self.name),
+            false => self.name.clone(),
+        }
+    }
 }
 
 /// A finished evaluation.
@@ -328,6 +340,7 @@ impl TableInputs<'_> {
                 self.poses,
                 &self.protocol.thresholds,
             ),
+            leaks: false,
         }
     }
 

@@ -112,6 +112,7 @@ pub fn score_predictions(
         n: pairs.len(),
         latent,
         retrieval,
+        leaks: false,
     })
 }
 

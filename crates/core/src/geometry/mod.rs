@@ -20,7 +20,7 @@ pub use given_pose::{
 };
 pub use pose_error::PoseError;
 pub use rotation::{NearestRotation, nearest_rotation};
-pub use se3::{Twist, adjoint, body_twist, exp, left_jacobian_inverse, log};
+pub use se3::{Twist, adjoint, body_twist, exp, left_jacobian_inverse, log, twist_covariance};
 
 /// A camera's position and orientation, `world_from_camera`, meters.
 pub type Pose = nalgebra::Isometry3<f64>;

@@ -189,6 +189,16 @@ pub fn adjoint(b_from_a: &Pose) -> Matrix6<f64> {
     ad
 }
 
+/// The covariance of the six numbers of a twist, (v, ω). `covariance` is that of δ in
+/// true motion = exp(twist) · exp(δ).
+///
+/// log(exp(ξ) exp(δ)) = ξ + J_r⁻¹(ξ) δ to first order, so it is J_r⁻¹ Σ J_r⁻ᵀ.
+pub fn twist_covariance(twist: &Twist, covariance: &Matrix6<f64>) -> Matrix6<f64> {
+    let inverse = left_jacobian_inverse(&twist.reversed());
+    let covariance = inverse * covariance * inverse.transpose();
+    (covariance + covariance.transpose()) * 0.5
+}
+
 /// The inverse left Jacobian of SE(3) at a twist, on (v, ω): log(exp(δ) exp(ξ)) = ξ + J_l⁻¹(ξ) δ to
 /// first order in δ.
 ///

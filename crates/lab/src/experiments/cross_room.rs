@@ -370,6 +370,7 @@ mod tests {
             n: 10,
             latent: None,
             retrieval: retrieval(hits),
+            leaks: false,
         };
 
         let outcome = |ours, identity| RoomOutcome {

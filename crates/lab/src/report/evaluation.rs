@@ -19,7 +19,9 @@ pub fn evaluation_table(report: &Report) -> String {
     let hits: String = thresholds
         .map(|epsilon| format!(" | Hit@{epsilon} [95 %]"))
         .collect();
-    let mut scores = Table::new(&format!("navigator | n | MSE | R² | Top-1{hits}"));
+    let mut scores = Table::new(&format!(
+        "navigator | n | latent MSE | latent R² | Top-1{hits}"
+    ));
 
     for row in &report.rows {
         let latent =
@@ -31,7 +33,7 @@ pub fn evaluation_table(report: &Report) -> String {
             format!("{:.3}", row.retrieval.top1.rate),
         ];
         let hits = row.retrieval.hits.iter().map(|(_, rate)| interval(rate));
-        scores.row(&row.name, cells.into_iter().chain(hits));
+        scores.row(row.label(), cells.into_iter().chain(hits));
     }
 
     let mut poses = Table::new("navigator | median m | median ° | 5 cm 5° | 10 cm 5° | 50 cm 5°");
@@ -53,7 +55,7 @@ pub fn evaluation_table(report: &Report) -> String {
             .iter()
             .filter(|recall| shown.contains(&(recall.translation_m, recall.rotation_deg)))
             .map(|recall| format!("{:.3}", recall.rate.rate));
-        poses.row(&row.name, medians.into_iter().chain(recalls));
+        poses.row(row.label(), medians.into_iter().chain(recalls));
     }
 
     format!("{scores}\n\n{poses}")
@@ -207,6 +209,7 @@ impl Serialize for NavigatorJson<'_> {
             n,
             latent,
             retrieval,
+            leaks,
         } = self.0;
 
         // Hit rates are keyed by ε as text.
@@ -221,12 +224,13 @@ impl Serialize for NavigatorJson<'_> {
         let rotation_deg = retrieval.rotation_rad_median.to_degrees();
 
         // Scores of the predicted latent are null for a navigator that does not predict one.
-        let mut record = to.serialize_struct("Navigator", 12)?;
+        let mut record = to.serialize_struct("Navigator", 13)?;
         record.serialize_field("name", name)?;
+        record.serialize_field("leaks", leaks)?;
         record.serialize_field("n", n)?;
-        record.serialize_field("mse", &latent.map(|latent| latent.mse))?;
-        record.serialize_field("r2", &latent.map(|latent| latent.r2))?;
-        record.serialize_field("r2_uniform", &latent.map(|latent| latent.r2_uniform))?;
+        record.serialize_field("latent_mse", &latent.map(|latent| latent.mse))?;
+        record.serialize_field("latent_r2", &latent.map(|latent| latent.r2))?;
+        record.serialize_field("latent_r2_uniform", &latent.map(|latent| latent.r2_uniform))?;
         record.serialize_field("top1", &retrieval.top1.rate)?;
         record.serialize_field("top1_interval", &retrieval.top1)?;
         record.serialize_field("hit", &hits)?;

@@ -33,7 +33,7 @@ pub fn hit_curves(report: &Report, title: String) -> Figure {
     let curve = |row: &Row| {
         let hits = row.retrieval.hits.iter();
         Series::line(
-            &row.name,
+            row.label(),
             hits.map(|(epsilon, rate)| [*epsilon, rate.rate]).collect(),
         )
     };
@@ -48,12 +48,13 @@ pub fn evaluation_csv(report: &Report) -> String {
         format!(" | hit@{e} | hit@{e}_low | hit@{e}_high")
     });
     let mut table = Table::new(&format!(
-        "navigator | n | mse | r2 | top1 | top1_low | top1_high{hits} | median_m | median_deg"
+        "navigator | leak | n | latent_mse | latent_r2 | top1 | top1_low | top1_high{hits} | median_m | median_deg"
     ));
 
     let number = |value: Option<f64>| value.map_or(String::new(), |value| value.to_string());
     for row in &report.rows {
         let latent = [
+            if row.leaks { "LEAK" } else { "" }.to_owned(),
             row.n.to_string(),
             number(row.latent.map(|latent| latent.mse)),
             number(row.latent.map(|latent| latent.r2)),
@@ -72,7 +73,7 @@ pub fn evaluation_csv(report: &Report) -> String {
 pub fn evaluation_latex(report: &Report) -> String {
     let hits = over_thresholds(report, |epsilon| format!(" | Hit@{epsilon}"));
     let mut table = Table::new(&format!(
-        "navigator | $R^2${hits} | median m | median $^\\circ$"
+        "navigator | latent $R^2${hits} | median m | median $^\\circ$"
     ));
 
     for row in &report.rows {
@@ -88,7 +89,7 @@ pub fn evaluation_latex(report: &Report) -> String {
         let cells = std::iter::once(r2.unwrap_or("--".to_owned()))
             .chain(hits)
             .chain([format!("{metres:.3}"), format!("{degrees:.2}")]);
-        table.row(&row.name, cells);
+        table.row(row.label(), cells);
     }
 
     format!(

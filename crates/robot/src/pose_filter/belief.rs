@@ -5,7 +5,7 @@ use nalgebra::{Cholesky, Matrix6, SMatrix, SVector, Vector6};
 use super::{FilterParameters, MeasuredInertia};
 use crate::tracking::{Drift, MotionPrior, PoseWithCovariance};
 use crate::visual_odometry::VisualMotion;
-use seese3_core::geometry::{Pose, Twist, adjoint, exp, left_jacobian_inverse, log};
+use seese3_core::geometry::{Pose, Twist, adjoint, exp, log};
 
 pub const STATE: usize = 30;
 const JOINT: usize = 36;
@@ -519,13 +519,6 @@ impl Step {
     fn state_covariance<const N: usize>(&self, observed: &Observation<N>) -> SMatrix<f64, N, N> {
         observed.derivative * self.covariance * observed.derivative.transpose()
     }
-}
-
-/// Covariance of the error of the twist ξ of a motion, exp(ξ): J_r⁻¹(ξ) Σ J_r⁻ᵀ(ξ).
-pub fn twist_covariance(motion: &PoseWithCovariance) -> Matrix6<f64> {
-    let inverse = left_jacobian_inverse(&log(&motion.pose).reversed());
-    let covariance = inverse * motion.covariance * inverse.transpose();
-    (covariance + covariance.transpose()) * 0.5
 }
 
 /// √ρ L, with L Lᵀ the covariance of a located pose; zero if that is not positive definite.

@@ -40,10 +40,10 @@ use crate::tracking::{
     Drift, MeasuredPose, MotionPrior, PoseWithCovariance, Refusal, Status, Update, extent_m,
 };
 use crate::visual_odometry::VisualMotion;
-use belief::{Observation, Step, twist_covariance};
+use belief::{Observation, Step};
 use gravity::Tilted;
 use nalgebra::Matrix6;
-use seese3_core::geometry::{Pose, Twist, log};
+use seese3_core::geometry::{Pose, Twist, log, twist_covariance};
 use seese3_core::room::{FrameId, Room};
 
 /// Least variance of the independent noise of wheel odometry, squared meters and radians.
@@ -302,9 +302,10 @@ impl PoseFilter {
         let (status, reason) = self.status(state, frame, tilted);
         // A camera that is lost among several rooms has to be found again.
         let is_somewhere = status == Status::Lost && self.rooms.len() > 1;
+        let motion = log(&keyframe.since.pose);
         Ok(Update {
-            motion: log(&keyframe.since.pose),
-            motion_covariance: twist_covariance(&keyframe.since),
+            motion,
+            motion_covariance: twist_covariance(&motion, &keyframe.since.covariance),
             keyframe_sequence: keyframe.sequence,
             is_keyframe: state
                 .keyframe
@@ -312,6 +313,7 @@ impl PoseFilter {
             odom: state.odom_with_drift(),
             map_pose: (state.is_placed && !is_somewhere).then(|| belief.place()),
             velocity: (!is_first).then_some(belief.velocity),
+            velocity_covariance: belief.velocity_covariance(),
             status,
             reason,
             contradicted: state.contradicted_sensors(tilted),

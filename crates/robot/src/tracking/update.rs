@@ -81,6 +81,8 @@ pub struct Update {
     /// Camera velocity in its body frame, meters and radians per second; `None` for the first
     /// frame.
     pub velocity: Option<Twist>,
+    /// Covariance of the velocity's error, on (v, ω) per second.
+    pub velocity_covariance: Matrix6<f64>,
     /// Localization status.
     pub status: Status,
     /// Reason of the status, as text.

@@ -16,7 +16,7 @@ mod solver;
 use nalgebra::{Matrix6, Vector2, Vector3};
 
 use crate::matched_views::{ViewKeypoints, matched_keypoints, pixel_focal, plane_points};
-use seese3_core::geometry::{Pose, Twist, log};
+use seese3_core::geometry::{Pose, Twist, log, twist_covariance};
 pub(crate) use solver::usual_log_inverse_depth;
 
 /// Number of keypoints of each view that are matched.
@@ -51,6 +51,11 @@ pub struct MotionEstimate {
 }
 
 impl MotionEstimate {
+    /// The covariance of the six numbers of [`MotionEstimate::twist`], (v, ω).
+    pub fn twist_covariance(&self) -> Matrix6<f64> {
+        twist_covariance(&self.twist(), &self.covariance)
+    }
+
     /// The motion as a twist in the body frame of the first camera.
     pub fn twist(&self) -> Twist {
         log(&self.motion)

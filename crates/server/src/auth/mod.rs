@@ -144,7 +144,7 @@ impl Principal {
         &self.rights.rooms
     }
 
-    fn may(&self, verb: Verb) -> bool {
+    pub fn may(&self, verb: Verb) -> bool {
         self.rights.verbs.contains(&verb)
     }
 

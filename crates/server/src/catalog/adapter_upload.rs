@@ -5,19 +5,19 @@ use tonic::Streaming;
 
 use super::super::caller::Requester;
 use super::super::{Error, Handlers};
-use super::changes::{check_right, identity, named_whole, revision_to_wire};
-use super::room_upload::{expect_end, next};
+use super::changes::{check_right, identity, resource, revision_to_wire};
+use super::room_upload::{Mode, expect_end, next, upload_mode};
 use seese3_client::proto::v1 as pb;
-use seese3_store::{Kind, Published};
+use seese3_store::{Kind, Published, UploadPolicy};
 
 impl Handlers {
     /// Receives an adapter and publishes it.
     pub(super) async fn receive_adapter(
         &self,
         caller: Requester,
-        mut messages: Streaming<pb::PublishAdapterRequest>,
-    ) -> Result<pb::PublishAdapterResponse, Error> {
-        use pb::publish_adapter_request::Message as Wire;
+        mut messages: Streaming<pb::UploadAdapterRequest>,
+    ) -> Result<pb::UploadAdapterResponse, Error> {
+        use pb::upload_adapter_request::Message as Wire;
 
         let changes = self.changes()?.clone();
         let first = next(&mut messages, "adapter").await?.message;
@@ -28,9 +28,18 @@ impl Handlers {
             ));
         };
 
-        let name = named_whole("name", &upload.name, Kind::Adapter);
-        let name = name.map_err(|error| error.within("adapter"))?;
+        let within = |error: Error| error.within("adapter");
+        let name = resource(Kind::Adapter, &upload.adapter, None).map_err(within)?;
         check_right(&caller, &name)?;
+        let policy = match upload_mode(upload.mode).map_err(within)? {
+            Mode::Create => UploadPolicy::Create,
+            Mode::Replace => UploadPolicy::Replace,
+            Mode::Extend => {
+                let problem =
+                    "extends only rooms; replace the adapter, or upload it under another name";
+                return Err(within(Error::invalid("mode", problem)));
+            }
+        };
 
         // The manifest states the size of the weights, so no more memory is reserved or accepted.
         let size = seese3_store::stated_weights_size(&upload.manifest).map_err(unfit)?;
@@ -46,26 +55,30 @@ impl Handlers {
         let weights = checked.await.map_err(|_| Error::Internal)?.map_err(unfit)?;
         let store = changes.store_for(&caller);
         if upload.validate_only {
-            let check = async move { Ok(store.check_quotas(None).await?) };
+            let check = async move {
+                store.check_quotas(None).await?;
+                store.check_adapter_upload(&name.name, policy).await?;
+                Ok(())
+            };
             changes.validated(&caller.id, check).await?;
-            return Ok(pb::PublishAdapterResponse::default());
+            return Ok(pb::UploadAdapterResponse::default());
         }
 
         let content = upload.encode_to_vec();
-        let identity = identity(&caller, &upload.request_id, "PublishAdapter", &content);
+        let identity = identity(&caller, &upload.request_id, "UploadAdapter", &content);
         let published_as = name.name.clone();
         let change = async move {
             // Uploaded data counts toward the limit until it is stored.
             let _memory = memory;
             store
-                .publish_adapter_files(&name.name, &upload.manifest, weights)
+                .upload_adapter_files(&name.name, &upload.manifest, weights, policy)
                 .await
                 .map_err(unfit)
         };
         let handlers = self.clone();
         let answer = move |published: Published| {
             let revision = revision_to_wire(&published_as, &published);
-            pb::PublishAdapterResponse {
+            pb::UploadAdapterResponse {
                 served: handlers.serves(Kind::Adapter, &revision),
                 created: published.is_new,
                 revision: Some(revision),
@@ -77,10 +90,10 @@ impl Handlers {
 
 /// Receives the weights, `size` bytes according to the manifest.
 async fn weights(
-    messages: &mut Streaming<pb::PublishAdapterRequest>,
+    messages: &mut Streaming<pb::UploadAdapterRequest>,
     size: usize,
 ) -> Result<Vec<u8>, Error> {
-    use pb::publish_adapter_request::Message as Wire;
+    use pb::upload_adapter_request::Message as Wire;
 
     let mut weights = Vec::new();
     while weights.len() < size {

@@ -19,6 +19,7 @@ use super::super::status::Full;
 use super::super::{Config, Error, Handlers, Phase};
 use super::recent::{Identity, Recent};
 use seese3_client::proto::v1 as pb;
+use seese3_core::room::is_plain_name;
 use seese3_store::fit_stored_room;
 use seese3_store::{Kind, Published, Quota, Quotas, ResourceName, Scope, Store};
 
@@ -295,31 +296,28 @@ pub fn identity(caller: &Requester, request_id: &str, method: &str, content: &[u
     }
 }
 
-/// Parses the resource name of a change.
+/// The room or adapter that a change names, with its revision if one is given.
 ///
 /// # Errors
-/// [`Error::Invalid`] if it is not a name of this kind.
-pub fn named(field: &str, text: &str, kind: Kind) -> Result<ResourceName, Error> {
-    let resource: ResourceName = text.parse().map_err(|error| Error::invalid(field, error))?;
-    if resource.kind != kind {
-        let problem = format!("names no {kind}; write {}/NAME", kind.collection());
+/// [`Error::Invalid`] if the name is empty or not valid.
+pub fn resource(kind: Kind, name: &str, revision: Option<u64>) -> Result<ResourceName, Error> {
+    let field = match kind {
+        Kind::Room => "room",
+        Kind::Adapter => "adapter",
+    };
+    if name.is_empty() {
+        return Err(Error::invalid(field, "is required"));
+    }
+    if !is_plain_name(name) {
+        let problem = format!("{name:?} is no name: use 1 to 100 letters, digits, '.', '-' or '_'");
         return Err(Error::invalid(field, problem));
     }
 
-    Ok(resource)
-}
-
-/// Like [`named`], without a revision.
-///
-/// # Errors
-/// [`Error::Invalid`] if it is not a name of this kind, or has a revision.
-pub fn named_whole(field: &str, text: &str, kind: Kind) -> Result<ResourceName, Error> {
-    let resource = named(field, text, kind)?;
-    if resource.revision.is_some() {
-        return Err(Error::invalid(field, "must be without a revision"));
-    }
-
-    Ok(resource)
+    Ok(ResourceName {
+        kind,
+        name: name.to_owned(),
+        revision,
+    })
 }
 
 /// Checks the length of a free-text field.
@@ -377,10 +375,14 @@ impl From<seese3_store::Error> for Error {
                 ..
             } => Self::NotStored {
                 field: (*kind).to_owned(),
-                name: format!("{name}/revisions/{revision}"),
+                name: format!("{name} revision {revision}"),
             },
             E::UnknownFeatures { .. } | E::WhichFeatures { .. } => Self::invalid("features", error),
             E::Quota { .. } => Self::Quota {
+                problem: error.to_string(),
+            },
+            E::Exists { kind, .. } => Self::Exists {
+                field: (*kind).to_owned(),
                 problem: error.to_string(),
             },
             E::InUse { .. } | E::NothingToTakeBack => Self::Precondition(error.to_string()),

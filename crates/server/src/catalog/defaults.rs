@@ -1,4 +1,4 @@
-//! Sets and rolls back defaults, and removes rooms, adapters and revisions.
+//! Sets and clears defaults, and removes rooms, adapters and revisions.
 
 use prost::Message;
 
@@ -6,10 +6,10 @@ use super::super::auth::RoomScope;
 use super::super::caller::Requester;
 use super::super::snapshot::Snapshot;
 use super::super::{Error, Handlers};
-use super::changes::{check_right, identity, named, named_whole};
+use super::changes::{check_right, identity, resource};
 use super::recent::Identity;
 use seese3_client::proto::v1 as pb;
-use seese3_store::{Choice, Defaults, Kind, ResourceName};
+use seese3_store::{Choice, Cleared, Defaults, Kind, ResourceName};
 
 impl Handlers {
     pub(super) async fn set(
@@ -17,86 +17,92 @@ impl Handlers {
         caller: Requester,
         request: pb::SetDefaultRequest,
     ) -> Result<pb::SetDefaultResponse, Error> {
-        use pb::set_default_request::Default as Wire;
+        use pb::catalog_default::Default as Wire;
 
         let content = request.encode_to_vec();
         let identity = identity(&caller, &request.request_id, "SetDefault", &content);
 
         // Destructured with no `..`, so that a new field breaks the build here.
         let pb::SetDefaultRequest {
-            name,
             default,
             request_id: _,
             validate_only,
         } = request;
 
-        let resource: ResourceName = name
-            .parse()
-            .map_err(|error| Error::invalid("name", error))?;
-        check_right(&caller, &resource)?;
-        if resource.revision.is_some() {
-            let problem = "must not name a revision; give it as `revision`";
-            return Err(Error::invalid("name", problem));
-        }
-
-        let choice = match default {
-            None => Choice::Nothing(resource),
-            Some(Wire::Revision(revision)) => Choice::Revision(resource.at(revision)),
-            Some(Wire::Adapter(adapter)) => {
-                if resource.kind != Kind::Room {
-                    let problem = "is only for rooms";
-                    return Err(Error::invalid("adapter", problem));
-                }
-                let adapter = named_whole("adapter", &adapter, Kind::Adapter)?.name;
+        let required = || Error::invalid("default", "is required");
+        let choice = match default
+            .and_then(|default| default.default)
+            .ok_or_else(required)?
+        {
+            Wire::RoomAdapter(pb::RoomAdapter { room, adapter }) => {
+                check_right(&caller, &ResourceName::room(&room))?;
                 let snapshot = self.reloaded(&caller).await?;
-                check_default_adapter(&snapshot, &resource.name, &adapter)?;
-                Choice::Adapter {
-                    room: resource.name,
-                    adapter,
-                }
+                check_default_adapter(&snapshot, &room, &adapter)
+                    .map_err(|error| error.within("default.room_adapter"))?;
+                Choice::Adapter { room, adapter }
             }
+            Wire::RoomRevision(of) => revision_of(Kind::Room, of, &caller)?,
+            Wire::AdapterRevision(of) => revision_of(Kind::Adapter, of, &caller)?,
         };
 
+        let answer = |defaults| pb::SetDefaultResponse { defaults };
+        self.change_default(caller, identity, choice, validate_only, answer)
+            .await
+    }
+
+    pub(super) async fn clear(
+        &self,
+        caller: Requester,
+        request: pb::ClearDefaultRequest,
+    ) -> Result<pb::ClearDefaultResponse, Error> {
+        use pb::clear_default_request::Default as Wire;
+
+        let content = request.encode_to_vec();
+        let identity = identity(&caller, &request.request_id, "ClearDefault", &content);
+
+        // Destructured with no `..`, so that a new field breaks the build here.
+        let pb::ClearDefaultRequest {
+            default,
+            request_id: _,
+            validate_only,
+        } = request;
+
+        let required = || Error::invalid("default", "is required");
+        let cleared = match default.ok_or_else(required)? {
+            Wire::RoomAdapter(room) => Cleared::AdapterOf { room },
+            Wire::RoomRevision(room) => Cleared::RevisionOf(ResourceName::room(room)),
+            Wire::AdapterRevision(adapter) => Cleared::RevisionOf(ResourceName::adapter(adapter)),
+        };
+        check_right(&caller, &cleared.resource())?;
+
+        let answer = |defaults| pb::ClearDefaultResponse { defaults };
+        let choice = Choice::Cleared(cleared);
+        self.change_default(caller, identity, choice, validate_only, answer)
+            .await
+    }
+
+    /// Makes a change of the defaults, or only checks it.
+    async fn change_default<A: Message + Default + 'static>(
+        &self,
+        caller: Requester,
+        identity: Identity,
+        choice: Choice,
+        validate_only: bool,
+        answer: impl FnOnce(Vec<pb::CatalogDefault>) -> A + Send + 'static,
+    ) -> Result<A, Error> {
         let changes = self.changes()?.clone();
+        let store = changes.store.clone();
         if validate_only {
-            let store = changes.store.clone();
             let check = async move {
                 store.check_choice(&choice).await?;
                 Ok(store.defaults().await?)
             };
             let defaults = changes.validated(&caller.id, check).await?;
-            let defaults = defaults_to_wire(&defaults, caller.scope());
-            return Ok(pb::SetDefaultResponse { defaults });
+            return Ok(answer(defaults_to_wire(&defaults, caller.scope())));
         }
 
-        let store = changes.store.clone();
         let change = async move { Ok(store.choose(&choice).await?) };
-        let answer = move |defaults: Defaults| pb::SetDefaultResponse {
-            defaults: defaults_to_wire(&defaults, caller.scope()),
-        };
-        changes.once(identity, change, answer).await
-    }
-
-    pub(super) async fn roll_back(
-        &self,
-        caller: Requester,
-        request: pb::RollBackDefaultRequest,
-    ) -> Result<pb::RollBackDefaultResponse, Error> {
-        // The last change may concern any room.
-        if caller.scope().is_some_and(|scope| !scope.is_all()) {
-            return Err(Error::OutOfScope {
-                what: "the defaults of all rooms",
-            });
-        }
-
-        let content = request.encode_to_vec();
-        let identity = identity(&caller, &request.request_id, "RollBackDefault", &content);
-        let changes = self.changes()?.clone();
-        let store = changes.store.clone();
-        let change = async move { Ok(store.take_back_choice().await?) };
-        let answer = |defaults: Defaults| pb::RollBackDefaultResponse {
-            defaults: defaults_to_wire(&defaults, None),
-        };
+        let answer = move |defaults: Defaults| answer(defaults_to_wire(&defaults, caller.scope()));
         changes.once(identity, change, answer).await
     }
 
@@ -107,7 +113,7 @@ impl Handlers {
     ) -> Result<pb::DeleteRoomResponse, Error> {
         let content = request.encode_to_vec();
         let identity = identity(&caller, &request.request_id, "DeleteRoom", &content);
-        let resource = named("name", &request.name, Kind::Room)?;
+        let resource = resource(Kind::Room, &request.room, request.room_revision)?;
         check_right(&caller, &resource)?;
 
         let answer = |revisions| pb::DeleteRoomResponse { revisions };
@@ -123,7 +129,7 @@ impl Handlers {
     ) -> Result<pb::DeleteAdapterResponse, Error> {
         let content = request.encode_to_vec();
         let identity = identity(&caller, &request.request_id, "DeleteAdapter", &content);
-        let resource = named("name", &request.name, Kind::Adapter)?;
+        let resource = resource(Kind::Adapter, &request.adapter, request.adapter_revision)?;
         let store = self.changes()?.store.clone();
         let adapter = resource.clone();
         let right = async move {
@@ -180,7 +186,7 @@ impl Handlers {
 /// not; [`Error::Invalid`] if it does not serve the room.
 fn check_default_adapter(snapshot: &Snapshot, room: &str, adapter: &str) -> Result<(), Error> {
     snapshot.adapter(adapter)?;
-    let room = snapshot.room(room).map_err(|error| error.named("name"))?;
+    let room = snapshot.room(room)?;
     if room
         .adapters()
         .iter()
@@ -190,35 +196,60 @@ fn check_default_adapter(snapshot: &Snapshot, room: &str, adapter: &str) -> Resu
     }
 
     let problem = format!(
-        "does not serve rooms/{}: it is fitted to another room, or the room has no features of its source",
+        "does not serve room '{}': it is fitted to another room, or the room has no features of its source",
         room.id
     );
     Err(Error::invalid("adapter", problem))
 }
 
+/// The change that sets the default revision of a room or an adapter.
+fn revision_of(kind: Kind, of: pb::Revision, caller: &Requester) -> Result<Choice, Error> {
+    let pb::Revision { name, revision } = of;
+    if name.is_empty() || revision == 0 {
+        let problem = "name and revision are required";
+        return Err(Error::invalid(format!("default.{kind}_revision"), problem));
+    }
+
+    let resource = resource(kind, &name, Some(revision))?;
+    check_right(caller, &resource)?;
+    Ok(Choice::Revision(resource))
+}
+
 /// Converts the defaults within the caller's scope to the wire type.
-fn defaults_to_wire(defaults: &Defaults, scope: Option<&RoomScope>) -> Vec<pb::Default> {
+fn defaults_to_wire(defaults: &Defaults, scope: Option<&RoomScope>) -> Vec<pb::CatalogDefault> {
+    use pb::catalog_default::Default as Wire;
+
     let is_seen = |resource: &ResourceName| match resource.kind {
         Kind::Room => scope.is_none_or(|scope| scope.contains(&resource.name)),
         Kind::Adapter => scope.is_none_or(RoomScope::is_all),
     };
 
-    defaults
-        .chosen()
-        .into_iter()
-        .filter(is_seen)
-        .map(|resource| {
-            let adapter = match resource.kind {
-                Kind::Room => defaults.adapter(&resource.name),
-                Kind::Adapter => None,
+    let mut wire = Vec::new();
+    for resource in defaults.chosen().into_iter().filter(is_seen) {
+        let name = resource.name;
+        if let Some(revision) = defaults.revision(resource.kind, &name) {
+            let of = pb::Revision {
+                name: name.clone(),
+                revision,
             };
-            pb::Default {
-                revision: defaults.revision(resource.kind, &resource.name),
-                adapter: adapter
-                    .map(|adapter| ResourceName::adapter(adapter).to_string())
-                    .unwrap_or_default(),
-                name: resource.to_string(),
-            }
+            wire.push(match resource.kind {
+                Kind::Room => Wire::RoomRevision(of),
+                Kind::Adapter => Wire::AdapterRevision(of),
+            });
+        }
+        if resource.kind == Kind::Room
+            && let Some(adapter) = defaults.adapter(&name)
+        {
+            wire.push(Wire::RoomAdapter(pb::RoomAdapter {
+                room: name.clone(),
+                adapter: adapter.to_owned(),
+            }));
+        }
+    }
+
+    wire.into_iter()
+        .map(|default| pb::CatalogDefault {
+            default: Some(default),
         })
         .collect()
 }

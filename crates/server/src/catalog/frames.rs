@@ -59,15 +59,16 @@ fn answer(
 ) -> Result<pb::ListFramesResponse, Error> {
     let pb::ListFramesRequest {
         room,
+        room_revision: _,
         page_size,
         page_token,
-        neighbours_within,
+        neighbors_within,
         thumbnail_width,
     } = request;
 
-    if neighbours_within.is_some_and(|hop| !(hop.is_finite() && hop > 0.0)) {
+    if neighbors_within.is_some_and(|hop| !(hop.is_finite() && hop > 0.0)) {
         return Err(Error::invalid(
-            "neighbours_within",
+            "neighbors_within",
             "must be finite and above 0",
         ));
     }
@@ -76,9 +77,10 @@ fn answer(
     }
 
     let length = page_length(page_size)?;
-    let served = snapshot.navigator(&room, "")?;
-    let room = served.navigator.room();
-    let first = first_frame(&page_token, served.room_revision)?;
+    let served = snapshot.room(&room)?;
+    let revision = convert::served_revision(served);
+    let room = &served.load()?.room;
+    let first = first_frame(&page_token, revision.revision)?;
     if thumbnail_width.is_some() && room.images().is_empty() {
         return Err(no_thumbnails("the server has no images of this room"));
     }
@@ -88,7 +90,7 @@ fn answer(
     let graph = PoseGraph::new(room.poses(), &all);
     let last = first.saturating_add(length).min(frame_count);
 
-    let neighbors = match neighbours_within {
+    let neighbors = match neighbors_within {
         Some(_) => MOST_NEIGHBOURS * NEIGHBOR_BYTES,
         None => 0,
     };
@@ -103,11 +105,11 @@ fn answer(
         }
 
         let mut wire = frame_to_wire(room, frame);
-        if let Some(hop) = neighbours_within {
-            wire.neighbours = graph
+        if let Some(hop) = neighbors_within {
+            wire.neighbors = graph
                 .neighbours(frame, hop, MOST_NEIGHBOURS)
                 .iter()
-                .map(|(frame, motion)| pb::NeighbourFrame {
+                .map(|(frame, motion)| pb::NeighborFrame {
                     frame_id: frame.0,
                     motion: Some(convert::twist_to_wire(motion)),
                 })
@@ -122,10 +124,10 @@ fn answer(
 
     let end = first.saturating_add(frames.len());
     Ok(pb::ListFramesResponse {
-        room: Some(convert::room_revision(&served)),
+        room: Some(revision.clone()),
         frames,
         next_page_token: if end < frame_count {
-            format!("{}.{end}", served.room_revision)
+            format!("{}.{end}", revision.revision)
         } else {
             String::new()
         },
@@ -165,8 +167,8 @@ fn frame_to_wire(room: &Room, frame: FrameId) -> pb::RoomFrame {
         )),
         frame_name: room.frame_names().get(row).cloned().unwrap_or_default(),
         timestamp_ns: room.timestamps_ns().get(row).copied(),
-        sequence: room.timeline().sequences.get(row).copied().unwrap_or(0),
-        neighbours: Vec::new(),
+        segment: room.timeline().sequences.get(row).copied().unwrap_or(0),
+        neighbors: Vec::new(),
         thumbnail: Vec::new(),
     }
 }

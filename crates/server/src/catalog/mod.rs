@@ -9,12 +9,14 @@
 //! | `adapter_upload` | uploads an adapter |
 //! | `frames` | lists the frames of a room, for clients that plan or draw |
 //! | `refits` | fits an adapter to a room on the server |
-//! | `defaults` | sets defaults and removes revisions |
+//! | `defaults` | sets and clears defaults, and removes revisions |
+//! | `info` | the version, the abilities and the limits of the server |
 
 mod adapter_upload;
 mod changes;
 mod defaults;
 mod frames;
+mod info;
 mod keypoints_upload;
 mod recent;
 mod refits;
@@ -35,9 +37,11 @@ use super::caller::Requester;
 use super::convert;
 use super::memory::respond;
 use super::snapshot::{ServedRoom, Snapshot};
+use super::workers::Lane;
 use super::{Error, Handlers, principal};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::catalog_service_server::CatalogService;
+use seese3_core::cancel::Cancellation;
 use seese3_core::geometry::Twist;
 use seese3_store::{RoomSummary, StoredAdapter};
 
@@ -71,10 +75,25 @@ impl CatalogService for Handlers {
     async fn get_room(
         &self,
         request: Request<pb::GetRoomRequest>,
-    ) -> Result<Response<pb::GetRoomResponse>, Status> {
-        let snapshot = self.snapshot(&request)?;
-        let room = room(&snapshot, snapshot.room(&request.into_inner().room)?);
-        Ok(Response::new(pb::GetRoomResponse { room: Some(room) }))
+    ) -> Result<Response<pb::Room>, Status> {
+        if request.get_ref().room_revision.is_none() {
+            // Answered at once, without waiting for a worker.
+            let snapshot = self.snapshot(&request)?;
+            let room = room(&snapshot, snapshot.room(&request.into_inner().room)?);
+            return Ok(Response::new(room));
+        }
+
+        let work = |snapshot: &Snapshot, request: pb::GetRoomRequest, _: &Cancellation| {
+            Ok(room(snapshot, snapshot.room(&request.room)?))
+        };
+        self.unary(request, |_, _| Lane::Short, work).await
+    }
+
+    async fn get_server_info(
+        &self,
+        request: Request<pb::GetServerInfoRequest>,
+    ) -> Result<Response<pb::ServerInfo>, Status> {
+        Ok(Response::new(self.info(&request)?))
     }
 
     async fn list_frames(
@@ -109,21 +128,25 @@ impl CatalogService for Handlers {
     async fn get_adapter(
         &self,
         request: Request<pb::GetAdapterRequest>,
-    ) -> Result<Response<pb::GetAdapterResponse>, Status> {
-        let snapshot = self.snapshot(&request)?;
+    ) -> Result<Response<pb::Adapter>, Status> {
         let scope = principal(&request).map(|caller| caller.rooms().clone());
-        let stored = snapshot.adapter(&request.into_inner().adapter)?;
-        let adapter = adapter(stored, scope.as_ref());
+        if request.get_ref().adapter_revision.is_none() {
+            // Answered at once, without waiting for a worker.
+            let snapshot = self.snapshot(&request)?;
+            let stored = snapshot.adapter(&request.into_inner().adapter)?;
+            return Ok(Response::new(adapter(stored, scope.as_ref())));
+        }
 
-        Ok(Response::new(pb::GetAdapterResponse {
-            adapter: Some(adapter),
-        }))
+        let work = move |snapshot: &Snapshot, request: pb::GetAdapterRequest, _: &Cancellation| {
+            Ok(adapter(snapshot.adapter(&request.adapter)?, scope.as_ref()))
+        };
+        self.unary(request, |_, _| Lane::Short, work).await
     }
 
-    async fn create_room(
+    async fn upload_room(
         &self,
-        request: Request<Streaming<pb::CreateRoomRequest>>,
-    ) -> Result<Response<pb::CreateRoomResponse>, Status> {
+        request: Request<Streaming<pb::UploadRoomRequest>>,
+    ) -> Result<Response<pb::UploadRoomResponse>, Status> {
         let snapshot = self.snapshot(&request)?;
         let caller = Requester::of(&request);
         let budget = self.workers.budget(request.metadata());
@@ -133,10 +156,10 @@ impl CatalogService for Handlers {
         Ok(Response::new(answer.map_err(|_| Error::Deadline)??))
     }
 
-    async fn publish_adapter(
+    async fn upload_adapter(
         &self,
-        request: Request<Streaming<pb::PublishAdapterRequest>>,
-    ) -> Result<Response<pb::PublishAdapterResponse>, Status> {
+        request: Request<Streaming<pb::UploadAdapterRequest>>,
+    ) -> Result<Response<pb::UploadAdapterResponse>, Status> {
         let caller = Requester::of(&request);
         let budget = self.workers.budget(request.metadata());
 
@@ -145,12 +168,12 @@ impl CatalogService for Handlers {
         Ok(Response::new(answer.map_err(|_| Error::Deadline)??))
     }
 
-    type RefitRoomStream = ReceiverStream<Result<pb::RefitRoomResponse, Status>>;
+    type FitAdapterStream = ReceiverStream<Result<pb::FitAdapterResponse, Status>>;
 
-    async fn refit_room(
+    async fn fit_adapter(
         &self,
-        request: Request<pb::RefitRoomRequest>,
-    ) -> Result<Response<Self::RefitRoomStream>, Status> {
+        request: Request<pb::FitAdapterRequest>,
+    ) -> Result<Response<Self::FitAdapterStream>, Status> {
         let caller = Requester::of(&request);
         let context = self.workers.context(&request);
         let admitted = self.admit_refit(&caller, request.into_inner()).await?;
@@ -169,12 +192,12 @@ impl CatalogService for Handlers {
         Ok(Response::new(answer))
     }
 
-    async fn roll_back_default(
+    async fn clear_default(
         &self,
-        request: Request<pb::RollBackDefaultRequest>,
-    ) -> Result<Response<pb::RollBackDefaultResponse>, Status> {
+        request: Request<pb::ClearDefaultRequest>,
+    ) -> Result<Response<pb::ClearDefaultResponse>, Status> {
         let caller = Requester::of(&request);
-        let answer = self.roll_back(caller, request.into_inner()).await?;
+        let answer = self.clear(caller, request.into_inner()).await?;
         Ok(Response::new(answer))
     }
 
@@ -256,10 +279,8 @@ fn room(snapshot: &Snapshot, served: &ServedRoom) -> pb::Room {
     } = &served.summary;
 
     pb::Room {
-        revision: Some(pb::Revision {
-            name: room.clone(),
-            revision: *revision,
-        }),
+        name: room.clone(),
+        revision: *revision,
         frame_count: *frame_count as u32,
         adapters: snapshot
             .adapters_of(served)
@@ -268,7 +289,7 @@ fn room(snapshot: &Snapshot, served: &ServedRoom) -> pb::Room {
             .collect(),
         features: features.iter().map(convert::source_to_wire).collect(),
         format: provenance.format.clone(),
-        licence: provenance.licence.clone(),
+        license: provenance.licence.clone(),
         worst_rotation_deviation: provenance.worst_rotation_deviation,
         create_time: convert::time_to_wire(created),
         camera: provenance.camera.as_ref().map(convert::camera_to_wire),
@@ -296,15 +317,13 @@ fn adapter(stored: &StoredAdapter, scope: Option<&RoomScope>) -> pb::Adapter {
     let scale = adapter.scale();
 
     pb::Adapter {
-        revision: Some(pb::Revision {
-            name: stored.name.clone(),
-            revision: stored.revision,
-        }),
+        name: stored.name.clone(),
+        revision: stored.revision,
         source: Some(convert::source_to_wire(adapter.source())),
         latent_dim: adapter.latent_dim() as u32,
         training_rooms: revisions(&record.rooms, scope),
         preset: record.preset.clone(),
-        split: record.split.name().to_owned(),
+        split: convert::split_to_wire(record.split).into(),
         stride: record.stride,
         seed: record.config.seed,
         test: Some(convert::scores_to_wire(&record.test)),
@@ -317,9 +336,9 @@ fn adapter(stored: &StoredAdapter, scope: Option<&RoomScope>) -> pb::Adapter {
         singular_values: adapter.inverse().singular_values().to_vec(),
         create_time: convert::time_to_wire(&stored.created),
         charts: adapter.network().chart_count() as u32,
-        loss: record.config.loss.name().to_owned(),
+        loss: convert::loss_to_wire(record.config.loss).into(),
         navigators: convert::navigator_names(adapter),
-        mixing: adapter.network().mixing().name().to_owned(),
+        mixing: convert::mixing_to_wire(adapter.network().mixing()).into(),
         calibration_rooms: revisions(&record.calibrated_on, scope),
     }
 }

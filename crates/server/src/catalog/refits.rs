@@ -11,7 +11,7 @@ use tonic::Status;
 use super::super::caller::Requester;
 use super::super::workers::{CallContext, Lane};
 use super::super::{Error, Handlers};
-use super::changes::{check_right, identity, named_whole, revision_to_wire};
+use super::changes::{check_right, identity, resource, revision_to_wire};
 use super::recent::Identity;
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
@@ -20,7 +20,7 @@ use seese3_store::fit_stored_room::{Refit, Request};
 use seese3_store::{Kind, Published, Store};
 
 /// Sender of a fit's events.
-pub type Events = mpsc::Sender<Result<pb::RefitRoomResponse, Status>>;
+pub type Events = mpsc::Sender<Result<pb::FitAdapterResponse, Status>>;
 
 /// Maximum seed: 32 bits, portable to other programs.
 const LARGEST_SEED: u64 = u32::MAX as u64;
@@ -43,14 +43,14 @@ impl Handlers {
     pub(super) async fn admit_refit(
         &self,
         caller: &Requester,
-        request: pb::RefitRoomRequest,
+        request: pb::FitAdapterRequest,
     ) -> Result<Admitted, Error> {
         let content = request.encode_to_vec();
-        let identity = identity(caller, &request.request_id, "RefitRoom", &content);
+        let identity = identity(caller, &request.request_id, "FitAdapter", &content);
 
         // Destructured with no `..`, so that a new field breaks the build here.
-        let pb::RefitRoomRequest {
-            name,
+        let pb::FitAdapterRequest {
+            room,
             base_adapter,
             features,
             fitted_adapter,
@@ -60,7 +60,7 @@ impl Handlers {
         } = request;
 
         self.changes()?;
-        let room = named_whole("name", &name, Kind::Room)?;
+        let room = resource(Kind::Room, &room, None)?;
         check_right(caller, &room)?;
         if seed > LARGEST_SEED {
             let problem = format!("must be at most {LARGEST_SEED}, got {seed}");
@@ -70,7 +70,10 @@ impl Handlers {
         let adapter = |field: &str, given: &str| -> Result<Option<String>, Error> {
             match given {
                 "" => Ok(None),
-                given => Ok(Some(named_whole(field, given, Kind::Adapter)?.name)),
+                given => {
+                    let adapter = resource(Kind::Adapter, given, None);
+                    Ok(Some(adapter.map_err(|error| error.named(field))?.name))
+                }
             }
         };
         let fitted_adapter = adapter("fitted_adapter", &fitted_adapter)?;
@@ -118,9 +121,9 @@ impl Handlers {
             tracing::warn!(%error, "the fit failed");
         }
 
-        let event = result.map(pb::refit_room_response::Event::Result);
+        let event = result.map(pb::fit_adapter_response::Event::Result);
         let last = event
-            .map(|event| pb::RefitRoomResponse { event: Some(event) })
+            .map(|event| pb::FitAdapterResponse { event: Some(event) })
             .map_err(Status::from);
         // This fails only if the caller has disconnected.
         let _ = events.send(last).await;
@@ -131,7 +134,7 @@ impl Handlers {
         admitted: Admitted,
         context: CallContext,
         progress: Arc<FitProgress>,
-    ) -> Result<pb::RefitResult, Error> {
+    ) -> Result<pb::FitResult, Error> {
         let Admitted {
             request,
             identity,
@@ -172,7 +175,7 @@ impl Handlers {
         };
         let (mut refit, fitted) = self.workers.run(Lane::Fit, context, fit).await?;
         let Some(fitted) = fitted else {
-            return Ok(pb::RefitResult::default());
+            return Ok(pb::FitResult::default());
         };
 
         let change = async move {
@@ -183,7 +186,7 @@ impl Handlers {
         let handlers = self.clone();
         let answer = move |(name, published): (String, Published)| {
             let revision = revision_to_wire(&name, &published);
-            pb::RefitResult {
+            pb::FitResult {
                 served: handlers.serves_in(&room, &revision),
                 created: published.is_new,
                 revision: Some(revision),
@@ -217,11 +220,11 @@ impl FitProgress {
     }
 
     fn send(&self) {
-        let progress = pb::RefitProgress {
+        let progress = pb::FitProgress {
             done: self.done.load(Ordering::Relaxed),
             total: FITTING_EPOCHS as u32,
         };
-        let event = Some(pb::refit_room_response::Event::Progress(progress));
-        let _ = self.events.try_send(Ok(pb::RefitRoomResponse { event }));
+        let event = Some(pb::fit_adapter_response::Event::Progress(progress));
+        let _ = self.events.try_send(Ok(pb::FitAdapterResponse { event }));
     }
 }

@@ -15,7 +15,7 @@ use super::super::snapshot::Snapshot;
 use super::super::workers::Lane;
 use super::super::{Error, Handlers, convert};
 use super::changes::{
-    Changes, check_length, check_right, identity, named_whole, on_blocking_thread, revision_to_wire,
+    Changes, check_length, check_right, identity, on_blocking_thread, resource, revision_to_wire,
 };
 use super::keypoints_upload::ReceivedKeypoints;
 use seese3_client::proto::v1 as pb;
@@ -23,7 +23,9 @@ use seese3_core::features::{FeatureSource, Features, MAX_COLUMNS, UNSPECIFIED};
 use seese3_core::geometry;
 use seese3_core::room::{Frames, MAX_FRAME_NAME, Provenance, Room, RoomId, is_plain_name};
 use seese3_data::pose_check::check_room;
-use seese3_store::{Kind, OtherFeatures, Published, ResourceName, RoomContents, RoomKeypoints};
+use seese3_store::{
+    Kind, OtherFeatures, Published, ResourceName, RoomContents, RoomKeypoints, Store, UploadPolicy,
+};
 
 /// Idle timeout of an upload.
 const SILENCE: Duration = Duration::from_secs(30);
@@ -66,6 +68,27 @@ pub async fn expect_end<M>(messages: &mut Streaming<M>) -> Result<(), Error> {
     }
 }
 
+/// What an upload may change.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Mode {
+    Create,
+    Replace,
+    Extend,
+}
+
+/// The mode of an upload.
+///
+/// # Errors
+/// [`Error::Invalid`] if there is no such mode.
+pub fn upload_mode(mode: i32) -> Result<Mode, Error> {
+    match pb::UploadMode::try_from(mode) {
+        Ok(pb::UploadMode::Unspecified | pb::UploadMode::Create) => Ok(Mode::Create),
+        Ok(pb::UploadMode::Replace) => Ok(Mode::Replace),
+        Ok(pb::UploadMode::Extend) => Ok(Mode::Extend),
+        Err(_) => Err(Error::invalid("mode", format!("has no value {mode}"))),
+    }
+}
+
 /// An upload in progress.
 struct Received {
     name: ResourceName,
@@ -105,9 +128,9 @@ impl Handlers {
         &self,
         caller: Requester,
         snapshot: Arc<Snapshot>,
-        mut messages: Streaming<pb::CreateRoomRequest>,
-    ) -> Result<pb::CreateRoomResponse, Error> {
-        use pb::create_room_request::Message as Wire;
+        mut messages: Streaming<pb::UploadRoomRequest>,
+    ) -> Result<pb::UploadRoomResponse, Error> {
+        use pb::upload_room_request::Message as Wire;
 
         let changes = self.changes()?.clone();
         let first = next(&mut messages, "room").await?.message;
@@ -115,7 +138,8 @@ impl Handlers {
             return Err(Error::invalid("room", "is required in the first message"));
         };
         let mut received = begun(&upload, &caller, &snapshot)?;
-        if upload.extend {
+        let mode = upload_mode(upload.mode).map_err(|error| error.within("room"))?;
+        if mode == Mode::Extend {
             let memory = changes.extension_memory(&caller.id, &received.name.name);
             received.memory.push(memory.await?);
         }
@@ -128,7 +152,7 @@ impl Handlers {
         let mut content = upload.encode_to_vec();
         content.extend(received.other_columns.clone().finalize());
         content.extend(&end.sha256);
-        let identity = identity(&caller, &upload.request_id, "CreateRoom", &content);
+        let identity = identity(&caller, &upload.request_id, "UploadRoom", &content);
 
         let name = received.name.name.clone();
         let memory = std::mem::take(&mut received.memory);
@@ -152,30 +176,21 @@ impl Handlers {
         if upload.validate_only {
             let check = async move {
                 store.check_quotas(Some(&room)).await?;
-                if upload.extend {
-                    store.extended_room(uploaded.contents(), others).await?;
-                }
-                Ok(())
+                uploaded.check(&store, mode, others).await
             };
             changes.validated(&caller.id, check).await?;
-            return Ok(pb::CreateRoomResponse::default());
+            return Ok(pb::UploadRoomResponse::default());
         }
 
-        let extend = upload.extend;
         let change = async move {
             // Uploaded data counts toward the limit until it is stored.
             let _memory = memory;
-            let published = if extend {
-                store.extend_room(uploaded.contents(), others).await
-            } else {
-                store.publish_contents(uploaded.contents()).await
-            };
-            Ok(published?)
+            Ok(uploaded.publish(&store, mode, others).await?)
         };
         let handlers = self.clone();
         let answer = move |published: Published| {
             let revision = revision_to_wire(&name, &published);
-            pb::CreateRoomResponse {
+            pb::UploadRoomResponse {
                 served: handlers.serves(Kind::Room, &revision),
                 created: published.is_new,
                 revision: Some(revision),
@@ -189,9 +204,9 @@ impl Handlers {
         &self,
         mut received: Received,
         snapshot: &Arc<Snapshot>,
-        messages: &mut Streaming<pb::CreateRoomRequest>,
+        messages: &mut Streaming<pb::UploadRoomRequest>,
     ) -> Result<(Received, pb::UploadEnd), Error> {
-        use pb::create_room_request::Message as Wire;
+        use pb::upload_room_request::Message as Wire;
 
         let changes = self.changes()?;
         loop {
@@ -283,10 +298,10 @@ fn begun(
     snapshot: &Snapshot,
 ) -> Result<Received, Error> {
     let within = |error: Error| error.within("room");
-    let name = named_whole("name", &upload.name, Kind::Room).map_err(within)?;
+    let name = resource(Kind::Room, &upload.room, None).map_err(within)?;
     check_right(caller, &name)?;
 
-    for (field, words) in [("format", &upload.format), ("licence", &upload.licence)] {
+    for (field, words) in [("format", &upload.format), ("license", &upload.license)] {
         check_length(field, words).map_err(within)?;
     }
 
@@ -302,10 +317,14 @@ fn begun(
             (sources.map_err(within)?, None)
         }
         ([], adapter) => {
-            let adapter = named_whole("encode_for", adapter, Kind::Adapter).map_err(within)?;
-            let stored = snapshot.adapter(&adapter.name)?;
+            let stored = snapshot
+                .adapter(adapter)
+                .map_err(|error| within(error.named("encode_for")))?;
             snapshot.image_encoder(stored)?;
-            (vec![stored.adapter.source().clone()], Some(adapter.name))
+            (
+                vec![stored.adapter.source().clone()],
+                Some(adapter.to_owned()),
+            )
         }
         _ => {
             let problem = "must be left out: the upload has features";
@@ -328,16 +347,19 @@ fn begun(
     })
 }
 
-/// Checks the fields whose validity depends on `extend`.
+/// Checks the fields that depend on the mode.
 fn check_extension(upload: &pb::RoomUpload) -> Result<(), Error> {
-    if !upload.extend {
+    if upload_mode(upload.mode)? != Mode::Extend {
         return match upload.drop_other_features {
-            true => Err(Error::invalid("drop_other_features", "needs extend")),
+            true => Err(Error::invalid(
+                "drop_other_features",
+                "needs UPLOAD_MODE_EXTEND",
+            )),
             false => Ok(()),
         };
     }
 
-    for (field, words) in [("format", &upload.format), ("licence", &upload.licence)] {
+    for (field, words) in [("format", &upload.format), ("license", &upload.license)] {
         if !words.is_empty() {
             let problem = "must be left out: a room that is extended keeps its own";
             return Err(Error::invalid(field, problem));
@@ -355,8 +377,8 @@ fn source(given: &pb::FeatureSource) -> Result<FeatureSource, Error> {
         pooling,
         preprocess,
         dim,
-        base,
-        norm,
+        layer_index_base,
+        final_norm,
     } = given.clone();
     let dim = dim as usize;
 
@@ -382,8 +404,8 @@ fn source(given: &pb::FeatureSource) -> Result<FeatureSource, Error> {
         name,
         encoder: or_unspecified("encoder", encoder)?,
         layer: or_unspecified("layer", layer)?,
-        base: or_unspecified("base", base)?,
-        norm: or_unspecified("norm", norm)?,
+        base: convert::layer_index_base(layer_index_base)?,
+        norm: convert::final_norm(final_norm)?,
         pooling: or_unspecified("pooling", pooling)?,
         preprocess: or_unspecified("preprocess", preprocess)?,
         dim,
@@ -410,7 +432,7 @@ impl Received {
             images,
             timestamps_ns,
             frame_names,
-            sequences,
+            segments,
         } = batch;
 
         let n = poses.len() / POSE_BYTES;
@@ -449,7 +471,7 @@ impl Received {
             }
         }
 
-        self.take_columns(before, n, timestamps_ns, frame_names, sequences)?;
+        self.take_columns(before, n, timestamps_ns, frame_names, segments)?;
         Ok((self, images))
     }
 
@@ -492,7 +514,7 @@ impl Received {
         n: usize,
         timestamps_ns: Vec<i64>,
         frame_names: Vec<String>,
-        sequences: Vec<u32>,
+        segments: Vec<u32>,
     ) -> Result<(), Error> {
         for (field, given, known) in [
             (
@@ -501,7 +523,7 @@ impl Received {
                 self.frames.timestamps_ns.len(),
             ),
             ("frame_names", frame_names.len(), self.frames.names.len()),
-            ("sequences", sequences.len(), self.frames.sequences.len()),
+            ("segments", segments.len(), self.frames.sequences.len()),
         ] {
             // A column has entries for all frames or for none.
             let is_for_all = given == n && known == before;
@@ -527,13 +549,13 @@ impl Received {
             self.other_columns.update((name.len() as u64).to_le_bytes());
             self.other_columns.update(name);
         }
-        for sequence in &sequences {
-            self.other_columns.update(sequence.to_le_bytes());
+        for segment in &segments {
+            self.other_columns.update(segment.to_le_bytes());
         }
 
         self.frames.timestamps_ns.extend(timestamps_ns);
         self.frames.names.extend(frame_names);
-        self.frames.sequences.extend(sequences);
+        self.frames.sequences.extend(segments);
         Ok(())
     }
 }
@@ -563,6 +585,36 @@ impl UploadedRoom {
             keypoints: self.keypoints.as_ref(),
         }
     }
+
+    /// Checks that the room can be published, without writing.
+    async fn check(&self, store: &Store, mode: Mode, others: OtherFeatures) -> Result<(), Error> {
+        match mode {
+            Mode::Create => store.check_upload(&self.room, UploadPolicy::Create).await?,
+            Mode::Replace => {
+                store
+                    .check_upload(&self.room, UploadPolicy::Replace)
+                    .await?;
+            }
+            Mode::Extend => {
+                store.extended_room(self.contents(), others).await?;
+            }
+        }
+        Ok(())
+    }
+
+    async fn publish(
+        &self,
+        store: &Store,
+        mode: Mode,
+        others: OtherFeatures,
+    ) -> Result<Published, seese3_store::Error> {
+        let contents = self.contents();
+        match mode {
+            Mode::Create => store.upload_contents(contents, UploadPolicy::Create).await,
+            Mode::Replace => store.upload_contents(contents, UploadPolicy::Replace).await,
+            Mode::Extend => store.extend_room(contents, others).await,
+        }
+    }
 }
 
 /// Builds a room from a complete upload, after checking frame count and checksum.
@@ -584,7 +636,7 @@ fn finished(
 
     let provenance = Provenance {
         format: upload.format.clone(),
-        licence: upload.licence.clone(),
+        licence: upload.license.clone(),
         images_root: String::new(),
         worst_rotation_deviation: received.worst_rotation_deviation,
         camera: upload

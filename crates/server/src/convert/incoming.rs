@@ -1,13 +1,12 @@
 //! Converts and validates incoming requests. Errors name the invalid field.
 
-use seese3_client::convert::{self, ConvertError};
-use strum::VariantArray;
-
 use super::super::Error;
 use super::super::snapshot::Snapshot;
 use super::{CAMERA, world_frame};
+use seese3_client::convert::{self, ConvertError};
 use seese3_client::proto::v1 as pb;
 use seese3_core::eval::{PredictedPair, Prediction, check_thresholds, default_thresholds};
+use seese3_core::features::UNSPECIFIED;
 use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera, Pose, Twist};
 use seese3_core::navigation::NavigatorKind;
 use seese3_core::navigation::{
@@ -177,7 +176,12 @@ pub fn source(
 
             Ok(Source::Feature(values))
         }
-        Some(pb::view::View::Latent(pb::Latent { values })) => Ok(Source::Latent(values)),
+        Some(pb::view::View::Latent(given)) => {
+            let values = latent(given, adapter);
+            values
+                .map(Source::Latent)
+                .map_err(|error| error.within(&format!("{field}.latent")))
+        }
         Some(pb::view::View::Image(image)) => Ok(Source::Feature(
             snapshot
                 .image_encoder(adapter)?
@@ -187,6 +191,65 @@ pub fn source(
             field,
             "is required: a frame_id, a feature, a latent or an image",
         )),
+    }
+}
+
+/// The numbers of a latent of this adapter.
+///
+/// # Errors
+/// [`Error::Invalid`] on `adapter` if the latent is one of another adapter or revision.
+fn latent(given: pb::Latent, adapter: &StoredAdapter) -> Result<Vec<f64>, Error> {
+    let pb::Latent {
+        values,
+        adapter: of,
+    } = given;
+    let Some(pb::Revision { name, revision }) = of else {
+        return Ok(values);
+    };
+
+    if (name.as_str(), revision) != (adapter.name.as_str(), adapter.revision) {
+        let problem = format!(
+            "is '{name}' revision {revision}; the request is answered with adapter '{}' revision {}: encode the \
+             view again, or name that adapter and revision",
+            adapter.name, adapter.revision
+        );
+        return Err(Error::invalid("adapter", problem));
+    }
+    Ok(values)
+}
+
+/// The name of a request's adapter: the stated one, else that of its first latent, else empty.
+///
+/// # Errors
+/// [`Error::Invalid`] if neither is stated and a view is a latent: the default adapter may be
+/// another one than that of the latent.
+pub fn stated_adapter<'a>(
+    adapter: &'a str,
+    views: impl IntoIterator<Item = &'a pb::View>,
+) -> Result<&'a str, Error> {
+    let latents = views.into_iter().filter_map(|view| match &view.view {
+        Some(pb::view::View::Latent(latent)) => Some(latent),
+        _ => None,
+    });
+    adapter_of_latents(adapter, latents)
+}
+
+/// As [`stated_adapter`], of latents.
+///
+/// # Errors
+/// As [`stated_adapter`].
+pub fn adapter_of_latents<'a>(
+    adapter: &'a str,
+    latents: impl IntoIterator<Item = &'a pb::Latent>,
+) -> Result<&'a str, Error> {
+    let first = latents.into_iter().next();
+    match (adapter, first.map(|latent| &latent.adapter)) {
+        ("", Some(Some(of))) => Ok(&of.name),
+        ("", Some(None)) => Err(Error::invalid(
+            "adapter",
+            "is required with a latent that does not name its adapter",
+        )),
+        (stated, _) => Ok(stated),
     }
 }
 
@@ -222,7 +285,7 @@ fn displacement(displacement: Option<pb::Displacement>, room: &str) -> Result<Di
     }
 }
 
-/// A navigation query, and the thresholds ε of Hit@ε for its errors.
+/// A navigation query.
 ///
 /// # Errors
 /// [`Error::Invalid`] on the invalid field; for an image also as [`source`].
@@ -230,29 +293,29 @@ pub fn query(
     request: pb::NavigateRequest,
     adapter: &StoredAdapter,
     snapshot: &Snapshot,
-) -> Result<(Query, Vec<f64>), Error> {
+) -> Result<Query, Error> {
     // Destructured without `..`, so that a new field fails to compile here.
     let pb::NavigateRequest {
         room,
+        room_revision: _,
         adapter: _,
+        adapter_revision: _,
         source: view,
         source_pose,
         displacement: wanted,
         steps,
-        mode,
-        reading,
+        step_mode,
+        inverse_variant,
         top_k,
         exclude_source,
         exclude_radius,
-        thresholds: given_thresholds,
         navigator,
     } = request;
 
     let displacement = displacement(wanted, &room)?;
-    let thresholds = thresholds(given_thresholds)?;
-    let (step, metric) = step_of(&navigator, reading)?;
+    let (step, metric) = step_of(&navigator, inverse_variant)?;
 
-    let mode = mode_of(mode)?;
+    let mode = mode_of(step_mode)?;
     let exclude_source = exclusion(exclude_source, exclude_radius)?;
     let source_pose = source_pose
         .map(|given| pose(given, &room).map_err(|error| error.within("source_pose")))
@@ -267,7 +330,7 @@ pub fn query(
         ));
     }
 
-    let query = Query {
+    Ok(Query {
         source: SourceAt {
             source,
             pose: source_pose,
@@ -280,23 +343,21 @@ pub fn query(
         fit_on: fit_on(adapter),
         top_k: top_k.unwrap_or(1),
         exclude_source,
-    };
-
-    Ok((query, thresholds))
+    })
 }
 
-/// Latent step method and retrieval metric of the navigator `name`; if empty, inverse Poincaré with
-/// the given reading.
-fn step_of(name: &str, reading: i32) -> Result<(StepKind, RetrievalMetric), Error> {
-    let given = reading_of(reading)?;
+/// Latent step method and retrieval metric of the navigator `name`; if empty, inverse Poincaré in
+/// the given variant.
+fn step_of(name: &str, variant: i32) -> Result<(StepKind, RetrievalMetric), Error> {
+    let given = variant_of(variant)?;
     if name.is_empty() {
         return Ok((StepKind::InversePoincare(given), RetrievalMetric::Full));
     }
 
-    // A navigator name determines the reading; a separate one could only contradict it.
-    if reading != pb::Reading::Unspecified as i32 {
+    // A navigator name determines the variant; a separate one could only contradict it.
+    if variant != pb::InverseVariant::Unspecified as i32 {
         return Err(Error::invalid(
-            "reading",
+            "inverse_variant",
             "must be left out with a navigator, which has its own",
         ));
     }
@@ -334,25 +395,27 @@ fn navigator_named(field: &str, name: &str) -> Result<NavigatorKind, Error> {
 }
 
 pub fn mode_of(mode: i32) -> Result<Mode, Error> {
-    match pb::Mode::try_from(mode) {
-        Ok(pb::Mode::Unspecified | pb::Mode::OpenLoop) => Ok(Mode::OpenLoop),
-        Ok(pb::Mode::Snap) => Ok(Mode::Snap),
-        Ok(pb::Mode::ClosedLoop) => Ok(Mode::ClosedLoop),
+    match pb::StepMode::try_from(mode) {
+        Ok(pb::StepMode::Unspecified | pb::StepMode::OpenLoop) => Ok(Mode::OpenLoop),
+        Ok(pb::StepMode::Snap) => Ok(Mode::Snap),
+        Ok(pb::StepMode::ClosedLoop) => Ok(Mode::ClosedLoop),
         Err(_) => Err(Error::invalid(
-            "mode",
+            "step_mode",
             format!("{mode} is not known to this server"),
         )),
     }
 }
 
-fn reading_of(reading: i32) -> Result<Reading, Error> {
-    match pb::Reading::try_from(reading) {
-        Ok(pb::Reading::Unspecified | pb::Reading::Homogeneous) => Ok(Reading::Homogeneous),
-        Ok(pb::Reading::Affine) => Ok(Reading::Affine),
-        Ok(pb::Reading::Literal) => Ok(Reading::Literal),
+fn variant_of(variant: i32) -> Result<Reading, Error> {
+    match pb::InverseVariant::try_from(variant) {
+        Ok(pb::InverseVariant::Unspecified | pb::InverseVariant::Homogeneous) => {
+            Ok(Reading::Homogeneous)
+        }
+        Ok(pb::InverseVariant::Affine) => Ok(Reading::Affine),
+        Ok(pb::InverseVariant::Literal) => Ok(Reading::Literal),
         Err(_) => Err(Error::invalid(
-            "reading",
-            format!("{reading} is not known to this server"),
+            "inverse_variant",
+            format!("{variant} is not known to this server"),
         )),
     }
 }
@@ -379,17 +442,65 @@ pub fn thresholds(given: Vec<f64>) -> Result<Vec<f64>, Error> {
     Ok(thresholds)
 }
 
-/// The split with this name; `None` if the name is empty.
-pub fn split(name: &str) -> Result<Option<Split>, Error> {
-    if name.is_empty() {
-        return Ok(None);
-    }
+/// The split of a request; `None` if it is unspecified.
+///
+/// # Errors
+/// [`Error::Invalid`] if there is no such split.
+pub fn split(given: i32) -> Result<Option<Split>, Error> {
+    Ok(Some(match pb::Split::try_from(given) {
+        Ok(pb::Split::Unspecified) => return Ok(None),
+        Ok(pb::Split::Time) => Split::Time,
+        Ok(pb::Split::Fold1) => Split::Fold1,
+        Ok(pb::Split::Fold2) => Split::Fold2,
+        Ok(pb::Split::Fold3) => Split::Fold3,
+        Ok(pb::Split::Fold4) => Split::Fold4,
+        Ok(pb::Split::Fold5) => Split::Fold5,
+        Ok(pb::Split::Blocks) => Split::Blocks,
+        Ok(pb::Split::Pairs) => Split::Pairs,
+        Ok(pb::Split::Dataset) => Split::Dataset,
+        Ok(pb::Split::Whole) => Split::Whole,
+        Err(_) => {
+            return Err(Error::invalid(
+                "split",
+                format!("{given} is not known to this server"),
+            ));
+        }
+    }))
+}
 
-    name.parse().map(Some).map_err(|_| {
-        let known = Split::VARIANTS.iter().map(|split| split.name());
-        let known = known.collect::<Vec<_>>().join(", ");
-        Error::invalid("split", format!("'{name}' must be one of {known}"))
-    })
+/// Where the numbering of layers starts, as a feature source states it.
+///
+/// # Errors
+/// [`Error::Invalid`] if there is no such value.
+pub fn layer_index_base(given: i32) -> Result<String, Error> {
+    let base = match pb::LayerIndexBase::try_from(given) {
+        Ok(pb::LayerIndexBase::Unspecified) => UNSPECIFIED,
+        Ok(pb::LayerIndexBase::Zero) => "0",
+        Ok(pb::LayerIndexBase::One) => "1",
+        Ok(pb::LayerIndexBase::Name) => "name",
+        Err(_) => {
+            let problem = format!("{given} is not known to this server");
+            return Err(Error::invalid("features.layer_index_base", problem));
+        }
+    };
+    Ok(base.to_owned())
+}
+
+/// Whether a final normalization was applied, as a feature source states it.
+///
+/// # Errors
+/// [`Error::Invalid`] if there is no such value.
+pub fn final_norm(given: i32) -> Result<String, Error> {
+    let norm = match pb::FinalNorm::try_from(given) {
+        Ok(pb::FinalNorm::Unspecified) => UNSPECIFIED,
+        Ok(pb::FinalNorm::None) => "none",
+        Ok(pb::FinalNorm::Applied) => "final",
+        Err(_) => {
+            let problem = format!("{given} is not known to this server");
+            return Err(Error::invalid("features.final_norm", problem));
+        }
+    };
+    Ok(norm.to_owned())
 }
 
 /// The named navigators of an evaluation. An empty list selects the default navigators.
@@ -413,7 +524,11 @@ pub fn navigators(names: &[String]) -> Result<Vec<NavigatorKind>, Error> {
         .collect()
 }
 
-pub fn prediction(position: usize, given: pb::Prediction) -> Result<PredictedPair, Error> {
+pub fn prediction(
+    position: usize,
+    given: pb::Prediction,
+    adapter: &StoredAdapter,
+) -> Result<PredictedPair, Error> {
     let pb::Prediction {
         source_frame_id,
         target_frame_id,
@@ -422,8 +537,10 @@ pub fn prediction(position: usize, given: pb::Prediction) -> Result<PredictedPai
     } = given;
 
     let prediction = match prediction {
-        Some(pb::prediction::Prediction::Latent(pb::Latent { values })) => {
-            Prediction::Latent(values)
+        Some(pb::prediction::Prediction::Latent(given)) => {
+            let values = latent(given, adapter);
+            let within = |error: Error| error.within(&format!("predictions[{position}].latent"));
+            Prediction::Latent(values.map_err(within)?)
         }
         Some(pb::prediction::Prediction::RetrievedFrameId(frame)) => {
             Prediction::Frame(FrameId(frame))

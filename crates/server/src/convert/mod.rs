@@ -5,7 +5,8 @@ mod incoming;
 mod outgoing;
 
 pub use incoming::{
-    camera, exclusion, mode_of, navigators, pose, prediction, query, source, split, thresholds,
+    adapter_of_latents, camera, exclusion, final_norm, layer_index_base, mode_of, navigators, pose,
+    prediction, query, source, split, stated_adapter, thresholds,
 };
 pub use outgoing::*;
 

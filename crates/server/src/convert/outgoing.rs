@@ -1,11 +1,11 @@
 //! Converts domain types to wire types for answers.
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix6, Vector3};
 
-use super::super::snapshot::ServedNavigator;
+use super::super::snapshot::{ServedNavigator, ServedRoom};
 use super::{CAMERA, world_frame};
 use seese3_client::proto::v1 as pb;
-use seese3_core::adapter::Adapter;
+use seese3_core::adapter::{Adapter, Loss, Mixing};
 use seese3_core::eval::{RetrievalScores, Row};
 use seese3_core::features::FeatureSource;
 use seese3_core::geometry::{CameraIntrinsics, Distortion, Pose, Twist};
@@ -15,7 +15,9 @@ use seese3_core::navigation::{
     AnswerStep, Mode, Query, Reading, RetrievedFrame, StepError, StepKind,
 };
 use seese3_core::room::Room;
+use seese3_core::splits::Split;
 use seese3_core::statistics::Rate;
+use seese3_store::StoredAdapter;
 
 pub fn vector_to_wire(vector: &Vector3<f64>) -> pb::Vector3 {
     pb::Vector3 {
@@ -26,7 +28,7 @@ pub fn vector_to_wire(vector: &Vector3<f64>) -> pb::Vector3 {
 }
 
 /// The 36 numbers of the matrix in row-major order.
-pub fn matrix_to_wire(matrix: &nalgebra::Matrix6<f64>) -> Vec<f64> {
+pub fn matrix_to_wire(matrix: &Matrix6<f64>) -> Vec<f64> {
     // nalgebra is column-major; iterating the transpose gives row-major order.
     matrix.transpose().iter().copied().collect()
 }
@@ -72,7 +74,7 @@ pub fn step_to_wire(
     number: usize,
     step: &AnswerStep,
     room: &Room,
-    thresholds: &[f64],
+    adapter: &pb::Revision,
 ) -> pb::NavigationStep {
     pb::NavigationStep {
         step: number as u32,
@@ -84,25 +86,19 @@ pub fn step_to_wire(
         requested_pose: step
             .requested_pose
             .map(|pose| pose_to_wire(&pose, room.id().as_str())),
-        error: step.error.map(|error| error_to_wire(&error, thresholds)),
+        error: step.error.map(|error| error_to_wire(&error)),
         latent: Some(pb::Latent {
             values: step.latent.to_vec(),
+            adapter: Some(adapter.clone()),
         }),
     }
 }
 
-pub fn error_to_wire(error: &StepError, thresholds: &[f64]) -> pb::PoseError {
+pub fn error_to_wire(error: &StepError) -> pb::PoseError {
     pb::PoseError {
         translation_m: error.pose.translation_m,
         rotation_rad: error.pose.rotation_rad,
         twist_norm: error.twist,
-        thresholds: thresholds
-            .iter()
-            .map(|&threshold| pb::ThresholdCheck {
-                threshold,
-                met: error.twist < threshold,
-            })
-            .collect(),
     }
 }
 
@@ -126,21 +122,21 @@ pub fn navigator_to_wire(query: &Query) -> String {
     NavigatorKind::Step(query.step, query.metric).name()
 }
 
-/// The reading of a step; unspecified for a navigator without one.
-pub fn reading_to_wire(step: StepKind) -> pb::Reading {
+/// The variant of a step's inverse; unspecified for a navigator without one.
+pub fn variant_to_wire(step: StepKind) -> pb::InverseVariant {
     match step {
-        StepKind::InversePoincare(Reading::Affine) => pb::Reading::Affine,
-        StepKind::InversePoincare(Reading::Homogeneous) => pb::Reading::Homogeneous,
-        StepKind::InversePoincare(Reading::Literal) => pb::Reading::Literal,
-        StepKind::Corrector(_) | StepKind::Refit(_) => pb::Reading::Unspecified,
+        StepKind::InversePoincare(Reading::Affine) => pb::InverseVariant::Affine,
+        StepKind::InversePoincare(Reading::Homogeneous) => pb::InverseVariant::Homogeneous,
+        StepKind::InversePoincare(Reading::Literal) => pb::InverseVariant::Literal,
+        StepKind::Corrector(_) | StepKind::Refit(_) => pb::InverseVariant::Unspecified,
     }
 }
 
-pub fn mode_to_wire(mode: Mode) -> pb::Mode {
+pub fn mode_to_wire(mode: Mode) -> pb::StepMode {
     match mode {
-        Mode::OpenLoop => pb::Mode::OpenLoop,
-        Mode::Snap => pb::Mode::Snap,
-        Mode::ClosedLoop => pb::Mode::ClosedLoop,
+        Mode::OpenLoop => pb::StepMode::OpenLoop,
+        Mode::Snap => pb::StepMode::Snap,
+        Mode::ClosedLoop => pb::StepMode::ClosedLoop,
     }
 }
 
@@ -148,6 +144,14 @@ pub fn room_revision(navigator: &ServedNavigator) -> pb::Revision {
     pb::Revision {
         name: navigator.navigator.room().id().to_string(),
         revision: navigator.room_revision,
+    }
+}
+
+/// The revision of a served room.
+pub fn served_revision(room: &ServedRoom) -> pb::Revision {
+    pb::Revision {
+        name: room.id.to_string(),
+        revision: room.summary.revision,
     }
 }
 
@@ -208,8 +212,8 @@ pub fn source_to_wire(source: &FeatureSource) -> pb::FeatureSource {
         pooling,
         preprocess,
         dim: dim as u32,
-        base,
-        norm,
+        layer_index_base: base_to_wire(&base).into(),
+        final_norm: norm_to_wire(&norm).into(),
     }
 }
 
@@ -244,19 +248,20 @@ pub fn row_to_wire(row: &Row) -> pb::NavigatorScores {
     pb::NavigatorScores {
         name: row.name.clone(),
         n: row.n as u32,
-        mse: row.latent.map(|latent| latent.mse),
-        r2: row
+        latent_mse: row.latent.map(|latent| latent.mse),
+        latent_r2: row
             .latent
             .map(|latent| latent.r2)
             .filter(|r2| r2.is_finite()),
-        top1: Some(rate_to_wire(top1)),
+        top1: Some(proportion_to_wire(top1)),
         hit_rates: hits
             .iter()
             .map(|(threshold, rate)| pb::HitRate {
                 threshold: *threshold,
-                rate: Some(rate_to_wire(rate)),
+                proportion: Some(proportion_to_wire(rate)),
             })
             .collect(),
+        leaks: row.leaks,
         translation_m_median: *translation_m_median,
         rotation_rad_median: *rotation_rad_median,
         recalls: pose_recalls
@@ -264,16 +269,85 @@ pub fn row_to_wire(row: &Row) -> pb::NavigatorScores {
             .map(|recall| pb::PoseRecall {
                 translation_m: recall.translation_m,
                 rotation_deg: recall.rotation_deg,
-                rate: Some(rate_to_wire(&recall.rate)),
+                proportion: Some(proportion_to_wire(&recall.rate)),
             })
             .collect(),
     }
 }
 
-fn rate_to_wire(rate: &Rate) -> pb::Rate {
-    pb::Rate {
-        rate: rate.rate,
+fn proportion_to_wire(rate: &Rate) -> pb::Proportion {
+    pb::Proportion {
+        value: rate.rate,
         low: rate.low,
         high: rate.high,
+    }
+}
+
+/// A split as a wire value.
+pub fn split_to_wire(split: Split) -> pb::Split {
+    match split {
+        Split::Time => pb::Split::Time,
+        Split::Fold1 => pb::Split::Fold1,
+        Split::Fold2 => pb::Split::Fold2,
+        Split::Fold3 => pb::Split::Fold3,
+        Split::Fold4 => pb::Split::Fold4,
+        Split::Fold5 => pb::Split::Fold5,
+        Split::Blocks => pb::Split::Blocks,
+        Split::Pairs => pb::Split::Pairs,
+        Split::Dataset => pb::Split::Dataset,
+        Split::Whole => pb::Split::Whole,
+    }
+}
+
+/// A training loss as a wire value.
+pub fn loss_to_wire(loss: Loss) -> pb::TrainingLoss {
+    match loss {
+        Loss::MeanSquaredError => pb::TrainingLoss::Mse,
+        Loss::Cosine => pb::TrainingLoss::Cosine,
+        Loss::Rotation => pb::TrainingLoss::Rotation,
+    }
+}
+
+/// The mixing of charts as a wire value.
+pub fn mixing_to_wire(mixing: Mixing) -> pb::ChartMixing {
+    match mixing {
+        Mixing::Gate => pb::ChartMixing::Gate,
+        Mixing::Even => pb::ChartMixing::Even,
+    }
+}
+
+/// Where the numbering of layers starts; unspecified for a value that this version does not know.
+fn base_to_wire(base: &str) -> pb::LayerIndexBase {
+    match base {
+        "0" => pb::LayerIndexBase::Zero,
+        "1" => pb::LayerIndexBase::One,
+        "name" => pb::LayerIndexBase::Name,
+        _ => pb::LayerIndexBase::Unspecified,
+    }
+}
+
+/// Whether a final normalization was applied; unspecified for a value that this version does not
+/// know.
+fn norm_to_wire(norm: &str) -> pb::FinalNorm {
+    match norm {
+        "none" => pb::FinalNorm::None,
+        "final" => pb::FinalNorm::Applied,
+        _ => pb::FinalNorm::Unspecified,
+    }
+}
+
+/// A motion and the covariance of its twist's six numbers; `None` if the errors were not measured.
+pub fn motion_to_wire(twist: &Twist, covariance: Option<&Matrix6<f64>>) -> pb::TwistWithCovariance {
+    pb::TwistWithCovariance {
+        twist: Some(twist_to_wire(twist)),
+        covariance: covariance.map_or_else(Vec::new, matrix_to_wire),
+    }
+}
+
+/// A revision of an adapter.
+pub fn stored_revision(stored: &StoredAdapter) -> pb::Revision {
+    pb::Revision {
+        name: stored.name.clone(),
+        revision: stored.revision,
     }
 }

@@ -249,7 +249,7 @@ mod tests {
             ("Prediction", size_of::<pb::Prediction>()),
             ("EvaluateRequest", size_of::<pb::EvaluateRequest>()),
             ("TrackRequest", size_of::<pb::TrackRequest>()),
-            ("CreateRoomRequest", size_of::<pb::CreateRoomRequest>()),
+            ("UploadRoomRequest", size_of::<pb::UploadRoomRequest>()),
         ] {
             let position = MESSAGES.positions[&format!("seese3.v1.{name}")];
             let computed = MESSAGES.shapes[position].size;

@@ -22,6 +22,7 @@ use super::super::metrics::Metrics;
 use super::super::{Config, RunError};
 use super::cache::RoomCache;
 use super::loaded::Candidate;
+use super::pinned::PinnedRevisions;
 use super::room_loading::{Problem, RoomLoader, contained};
 use super::served::ServedRoom;
 use super::{Refusal, Snapshot};
@@ -70,6 +71,7 @@ struct TriedRoom {
 pub struct Loader {
     store: Store,
     rooms: Arc<RoomCache>,
+    pinned: Arc<PinnedRevisions>,
     memory: RoomMemory,
     encoders: Option<ImageEncoders>,
     decoding: Arc<DecodingMemory>,
@@ -105,6 +107,7 @@ impl Loader {
             count_rooms(&rooms, &metrics);
 
             Ok(Self {
+                pinned: Arc::new(PinnedRevisions::new(store.clone(), rooms.clone())),
                 store,
                 rooms,
                 memory,
@@ -176,6 +179,7 @@ impl Loader {
     ) -> Result<Snapshot, RunError> {
         let mut loaded = Snapshot {
             decoding: self.decoding.clone(),
+            pinned: Some(self.pinned.clone()),
             ..Snapshot::default()
         };
 

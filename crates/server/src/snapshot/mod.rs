@@ -6,11 +6,13 @@ mod content;
 mod loading;
 mod room_loading;
 mod loaded;
+mod pinned;
 mod served;
 
 pub use content::frames_content;
 pub use loaded::{ServedKeypoints, ServedNavigator};
 pub use loading::{Loader, Refused, RoomMemory};
+use pinned::PinnedRevisions;
 use room_loading::Problem;
 pub use served::ServedRoom;
 
@@ -83,6 +85,8 @@ pub struct Snapshot {
     /// Memory for decoding images, shared with the encoders.
     decoding: Arc<DecodingMemory>,
     refused: Refusals,
+    /// Loads the revisions that requests state; `None` without a store.
+    pinned: Option<Arc<PinnedRevisions>>,
 }
 
 impl Snapshot {
@@ -114,12 +118,26 @@ impl Snapshot {
             image_encoders: self.image_encoders.clone(),
             keypoint_encoders: self.keypoint_encoders.clone(),
             decoding: self.decoding.clone(),
+            pinned: self.pinned.clone(),
             refused: Refusals {
                 rooms: owned(refused_rooms.filter(|(name, _)| scope.contains(name))),
                 // An adapter may be named after its room.
                 adapters: BTreeMap::new(),
                 defaults: None,
             },
+        }
+    }
+
+    fn copied(&self) -> Self {
+        Self {
+            rooms: self.rooms.clone(),
+            default_adapters: self.default_adapters.clone(),
+            adapters: self.adapters.clone(),
+            image_encoders: self.image_encoders.clone(),
+            keypoint_encoders: self.keypoint_encoders.clone(),
+            decoding: self.decoding.clone(),
+            refused: self.refused.clone(),
+            pinned: self.pinned.clone(),
         }
     }
 
@@ -203,6 +221,17 @@ impl Snapshot {
     /// Any encoder of images, for the limits that all share; `None` if this server has none.
     pub fn any_image_encoder(&self) -> Option<&ImageEncoder> {
         self.image_encoders.values().next().map(AsRef::as_ref)
+    }
+
+    /// The adapters whose features this server makes from images.
+    pub fn encoded_adapters(&self) -> impl Iterator<Item = &Arc<StoredAdapter>> {
+        let names = self.image_encoders.keys();
+        names.filter_map(|name| self.adapters.get(name))
+    }
+
+    /// The keypoints that this server detects.
+    pub fn keypoint_sources(&self) -> impl Iterator<Item = &KeypointSource> {
+        self.keypoint_encoders.iter().map(|(source, _)| source)
     }
 
     /// The encoder of keypoints; `None` if this server has no such encoder.

@@ -62,7 +62,7 @@ struct Incoming {
 #[derive(Debug, Clone, Copy)]
 pub struct Overtaken {
     pub timestamp_ns: i64,
-    pub sequence: u64,
+    pub sequence_number: u64,
     pub frames: u32,
 }
 
@@ -376,7 +376,7 @@ fn overtake(mut before: Incoming, came: &mut Incoming) -> Option<Incoming> {
     };
 
     // Late and duplicate frames must not replace a valid one; the tracker refuses each of them.
-    if new.timestamp_ns <= old.timestamp_ns || new.sequence <= old.sequence {
+    if new.timestamp_ns <= old.timestamp_ns || new.sequence_number <= old.sequence_number {
         return Some(before);
     }
 
@@ -393,7 +393,7 @@ fn overtake(mut before: Incoming, came: &mut Incoming) -> Option<Incoming> {
         .saturating_add(1);
     came.overtaken = Some(Overtaken {
         timestamp_ns: old.timestamp_ns,
-        sequence: old.sequence,
+        sequence_number: old.sequence_number,
         frames,
     });
 

@@ -51,7 +51,7 @@ impl TrackedRoom {
     fn of(served: &ServedRoom) -> Result<Self, Error> {
         let loaded = served.load()?;
         Ok(Self {
-            revision: super::super::localization::room_to_wire(served),
+            revision: super::super::convert::served_revision(served),
             room: loaded.room.clone(),
             keypoints: loaded.keypoints.clone(),
             tracking: loaded.tracking,

@@ -8,6 +8,7 @@ use super::super::convert;
 use super::super::embedding::{EmbeddedView, ImageKeypoints, StoredFrames, ViewEmbedder};
 use super::super::relocalization::maps;
 use super::super::snapshot::Snapshot;
+use super::super::stated_revisions::StatesRevisions;
 use super::Overtaken;
 use super::configuration::{StreamFrames, back_pressure, is_fused, parameters, rooms};
 use super::depth::DepthImage;
@@ -112,6 +113,7 @@ impl Session {
         was_of_keypoints: bool,
     ) -> Result<Self, Error> {
         // Validate everything before the stream starts.
+        let snapshot = &snapshot.with_revisions(&config.stated_revisions()?)?;
         let frames = StreamFrames::of(&config)?;
         let sensors = Sensors::of(&config, &frames)?;
         let inertial = Inertial::of(&config, &frames, sensors.gravity_in_map())?;
@@ -227,18 +229,21 @@ impl Session {
 
         let pb::TrackFrame {
             timestamp_ns,
-            sequence,
+            sequence_number,
             with_token,
             ..
         } = frame;
 
         let answer = match self.observe(frame) {
             Ok(update) => {
-                let best_camera = update
+                let camera = update
                     .best_match
                     .and_then(|best| best.camera)
                     .map_or_else(String::new, |number| self.sensors.camera_name(number));
-                let update = wire::update(&update, &self.frames, &self.rooms);
+                let mut update = wire::update(&update, &self.frames, &self.rooms);
+                if let Some(found) = &mut update.r#match {
+                    found.camera = camera;
+                }
 
                 // Measured from the frame's arrival, including the wait for a thread.
                 let elapsed_ns =
@@ -246,16 +251,15 @@ impl Session {
 
                 pb::track_response::Answer::Update(pb::TrackUpdate {
                     timestamp_ns,
-                    sequence,
-                    elapsed_ns,
-                    best_camera,
+                    sequence_number,
+                    timing: Some(pb::TrackTiming { elapsed_ns }),
                     ..update
                 })
             }
             Err(Refused::Frame(reason, message)) => {
                 pb::track_response::Answer::Refusal(pb::TrackRefusal {
                     timestamp_ns,
-                    sequence,
+                    sequence_number,
                     reason: reason as i32,
                     message,
                     frames: 1,
@@ -264,7 +268,7 @@ impl Session {
             Err(Refused::Server(error)) => return Err(error),
         };
 
-        Ok(if with_token || self.is_token_due(sequence) {
+        Ok(if with_token || self.is_token_due(sequence_number) {
             self.answer(answer)
         } else {
             without_token(answer)
@@ -272,11 +276,11 @@ impl Session {
     }
 
     /// Whether `token_every` adds a token to the answer for this sequence number.
-    fn is_token_due(&self, sequence: u64) -> bool {
+    fn is_token_due(&self, sequence_number: u64) -> bool {
         match self.config.token_every {
             None => true,
             Some(0) => false,
-            Some(every) => sequence.is_multiple_of(u64::from(every)),
+            Some(every) => sequence_number.is_multiple_of(u64::from(every)),
         }
     }
 
@@ -284,19 +288,19 @@ impl Session {
     pub fn superseded(&self, frames: Overtaken) -> pb::TrackResponse {
         let Overtaken {
             timestamp_ns,
-            sequence,
+            sequence_number,
             frames,
         } = frames;
 
         let answer = pb::track_response::Answer::Refusal(pb::TrackRefusal {
             timestamp_ns,
-            sequence,
+            sequence_number,
             reason: pb::TrackRefusalReason::Superseded as i32,
             message: "a newer frame arrived before this one was processed".to_owned(),
             frames,
         });
 
-        if self.is_token_due(sequence) {
+        if self.is_token_due(sequence_number) {
             self.answer(answer)
         } else {
             without_token(answer)
@@ -480,7 +484,7 @@ impl Session {
         let middle_ns = self.add_inertial(&frame);
         // A refused frame must not change what later views are compared with.
         let Engine { filter, state, .. } = &self.engine;
-        filter.check(state, frame.timestamp_ns, frame.sequence)?;
+        filter.check(state, frame.timestamp_ns, frame.sequence_number)?;
 
         let measured = self.measured(frame.odometry.clone())?;
         let gravity = frame
@@ -497,7 +501,7 @@ impl Session {
             measured,
             gravity,
             inertia,
-            ..ViewObservation::empty(frame.timestamp_ns, frame.sequence)
+            ..ViewObservation::empty(frame.timestamp_ns, frame.sequence_number)
         };
         let Engine { filter, state, .. } = &self.engine;
         let motion = filter.sensed_motion(state, &sensed);
@@ -572,7 +576,7 @@ impl Session {
         let retrieval = self.engine.retrieval.as_mut().ok_or(Error::Internal)?;
         let found = retrieval.front_end.read(&views, &retrieval.maps, room);
         let contradicted = image.why_not.filter(NotLocated::is_of_camera);
-        let observed = found.observation(&image, frame.timestamp_ns, frame.sequence);
+        let observed = found.observation(&image, frame.timestamp_ns, frame.sequence_number);
         Ok((observed, contradicted))
     }
 
@@ -590,7 +594,7 @@ impl Session {
         let image = self.keypoints_of(frame.view)?;
         let read = self.read(&image, depth.as_ref(), frame.timestamp_ns, motion)?;
         let fingerprint = image.fingerprint();
-        Ok(read.observation(frame.timestamp_ns, frame.sequence, fingerprint))
+        Ok(read.observation(frame.timestamp_ns, frame.sequence_number, fingerprint))
     }
 
     /// The camera pose of another sensor's odometry.

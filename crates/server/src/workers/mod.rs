@@ -91,16 +91,6 @@ pub struct CallContext {
     pub budget: Duration,
 }
 
-impl CallContext {
-    /// The same caller with the time that is left after `elapsed`.
-    pub fn after(self, elapsed: Duration) -> Self {
-        Self {
-            budget: self.budget.saturating_sub(elapsed),
-            ..self
-        }
-    }
-}
-
 /// Runs computations on blocking threads, separate from the async threads.
 #[derive(Clone)]
 pub struct Workers {

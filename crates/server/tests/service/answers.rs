@@ -3,6 +3,7 @@
 use pb::prediction::Prediction;
 use seese3_client::proto::v1 as pb;
 use seese3_server::Config;
+use tonic_types::RpcStatusExt as _;
 
 use crate::harness::{
     by_twist, by_twists, feature, feature_row, frame, latent, oracle, question, six, start,
@@ -16,8 +17,13 @@ fn expected() -> serde_json::Value {
 
 fn compare(what: &str, scores: &pb::NavigatorScores, expected: &serde_json::Value) {
     let r2 = number(&expected["r2_variance_weighted"]);
-    near(what, scores.mse.unwrap(), number(&expected["mse"]), 1e-9);
-    near(what, scores.r2.unwrap(), r2, 1e-8);
+    near(
+        what,
+        scores.latent_mse.unwrap(),
+        number(&expected["mse"]),
+        1e-9,
+    );
+    near(what, scores.latent_r2.unwrap(), r2, 1e-8);
 
     compare_hits(what, scores, &expected["source_included"]);
 }
@@ -26,7 +32,7 @@ fn compare_hits(what: &str, scores: &pb::NavigatorScores, included: &serde_json:
     assert_eq!(u64::from(scores.n), included["n"].as_u64().unwrap());
 
     for (found, key, bound) in [
-        (scores.top1.unwrap().rate, "top1", 1e-12),
+        (scores.top1.unwrap().value, "top1", 1e-12),
         (scores.translation_m_median, "median_t_m", 1e-9),
         (scores.rotation_rad_median, "median_R_rad", 1e-9),
     ] {
@@ -35,11 +41,11 @@ fn compare_hits(what: &str, scores: &pb::NavigatorScores, included: &serde_json:
 
     for hit in &scores.hit_rates {
         let key = hit.threshold.to_string();
-        let rate = hit.rate.unwrap();
+        let found = hit.proportion.unwrap();
         let [low, high] = [0, 1].map(|end| number(&included["hit_wilson95"][&key][end]));
-        near(what, rate.rate, number(&included["hit"][&key]), 1e-12);
-        near(what, rate.low, low, 1e-9);
-        near(what, rate.high, high, 1e-9);
+        near(what, found.value, number(&included["hit"][&key]), 1e-12);
+        near(what, found.low, low, 1e-9);
+        near(what, found.high, high, 1e-9);
     }
 }
 
@@ -89,13 +95,14 @@ async fn walks_that_snap_can_be_handed_in() {
     let (steps, stride, radius) = (3, 40, 30);
     let evaluate = pb::EvaluateRequest {
         room: "synthetic".to_owned(),
-        split: "whole".to_owned(),
+        adapter: "oracle".to_owned(),
+        split: pb::Split::Whole.into(),
         navigators: vec!["inverse-poincare-affine".to_owned()],
         stride: Some(stride),
         exclude_source: true,
         exclude_radius: radius,
         steps: Some(steps),
-        mode: pb::Mode::Snap.into(),
+        step_mode: pb::StepMode::Snap.into(),
         ..pb::EvaluateRequest::default()
     };
     let report = server.client.evaluate(evaluate, drop).await.unwrap();
@@ -107,7 +114,7 @@ async fn walks_that_snap_can_be_handed_in() {
             r.displacement = to_frame(source + stride);
             r.navigator = "inverse-poincare-affine".to_owned();
             r.steps = Some(steps);
-            r.mode = pb::Mode::Snap.into();
+            r.step_mode = pb::StepMode::Snap.into();
             (r.exclude_source, r.exclude_radius) = (true, radius);
         };
         let walked = server.navigated(walk).await.steps;
@@ -123,7 +130,8 @@ async fn walks_that_snap_can_be_handed_in() {
 
     let request = |predictions| pb::ScorePredictionsRequest {
         room: "synthetic".to_owned(),
-        split: "whole".to_owned(),
+        adapter: "oracle".to_owned(),
+        split: pb::Split::Whole.into(),
         exclude_source: true,
         exclude_radius: radius,
         predictions,
@@ -161,10 +169,20 @@ async fn a_clients_predictions_get_the_oracles_scores() {
         ..pb::Prediction::default()
     };
 
+    let oracle = pb::Revision {
+        name: "oracle".to_owned(),
+        revision: 1,
+    };
     let by_latent = latents.outer_iter().zip(pairs.clone());
     let by_latent = by_latent.map(|(latent, pair)| {
         let values = latent.to_vec();
-        prediction(pair, Prediction::Latent(pb::Latent { values }))
+        prediction(
+            pair,
+            Prediction::Latent(pb::Latent {
+                values,
+                adapter: Some(oracle.clone()),
+            }),
+        )
     });
 
     let by_frame = frames.iter().zip(pairs);
@@ -175,7 +193,7 @@ async fn a_clients_predictions_get_the_oracles_scores() {
 
     let request = |predictions| pb::ScorePredictionsRequest {
         room: "synthetic".to_owned(),
-        split: "time".to_owned(),
+        split: pb::Split::Time.into(),
         predictions,
         ..pb::ScorePredictionsRequest::default()
     };
@@ -188,7 +206,7 @@ async fn a_clients_predictions_get_the_oracles_scores() {
     compare("latents", &score(by_latent.collect()).await, expected);
 
     let scores = score(by_frame.collect()).await;
-    assert_eq!((scores.mse, scores.r2), (None, None));
+    assert_eq!((scores.latent_mse, scores.latent_r2), (None, None));
     compare_hits("frames", &scores, &expected["source_included"]);
 }
 
@@ -215,7 +233,7 @@ async fn estimated_motions_have_pytorchs_r2() {
             ..Default::default()
         };
         let estimate = server.client.estimate_motion(request).await.unwrap();
-        let motion = six(&estimate.motion.unwrap());
+        let motion = six(&estimate.motion.unwrap().twist.unwrap());
         predicted.row_mut(row).assign(&ndarray::arr1(&motion));
     }
 
@@ -232,12 +250,6 @@ async fn estimated_motions_have_pytorchs_r2() {
         let r2 = 1.0 - residual / total;
         near("R²", r2, number(&stated[component]), 1e-9);
     }
-}
-
-fn thresholds_are_met_below_them(error: &pb::PoseError) {
-    assert_eq!(error.thresholds.len(), 4);
-    let is_right = |hit: &pb::ThresholdCheck| hit.met == (error.twist_norm < hit.threshold);
-    assert!(error.thresholds.iter().all(is_right));
 }
 
 /// Oracle: SciPy's twist of the pair, and the definitions: the truth is log(P₁⁻¹P₂), a frame is its
@@ -258,10 +270,11 @@ async fn frames_of_a_room_are_answered_with_the_truth() {
     };
     let answer = estimate(frame(525)).await;
 
-    assert_eq!(answer.reader(), pb::MotionReader::Adapter);
-    assert!(answer.covariance.is_empty());
+    assert_eq!(answer.estimator(), pb::MotionEstimator::Adapter);
+    let motion = answer.motion.unwrap();
+    assert!(motion.covariance.is_empty());
 
-    let found = six(&answer.motion.unwrap());
+    let found = six(&motion.twist.unwrap());
     let stated = six(&answer.true_motion.unwrap());
     let mut squares = 0.0;
     for component in 0..6 {
@@ -272,8 +285,6 @@ async fn frames_of_a_room_are_answered_with_the_truth() {
     let error = answer.error.unwrap();
     near("error", error.twist_norm, squares.sqrt(), 1e-9);
 
-    thresholds_are_met_below_them(&error);
-
     // A feature has no pose.
     let blind = estimate(feature(feature_row(525))).await;
     assert!(blind.error.is_none() && blind.true_motion.is_none());
@@ -282,7 +293,7 @@ async fn frames_of_a_room_are_answered_with_the_truth() {
         r.rooms = vec!["synthetic".to_owned()];
         (r.view, r.top_k) = (frame(123), Some(2));
     });
-    let places = localized.await.places;
+    let places = localized.await.frames;
 
     assert_eq!(places[0].error.as_ref().unwrap().twist_norm, 0.0);
     assert!(places[1].error.as_ref().unwrap().translation_m > 0.0);
@@ -300,7 +311,7 @@ async fn a_closed_loop_steers_every_motion_to_its_planned_goal() {
     let go = async |from: u32, displacement| {
         let closed_loop = |r: &mut pb::NavigateRequest| {
             (r.source, r.displacement) = (frame(from), displacement);
-            r.mode = pb::Mode::ClosedLoop.into();
+            r.step_mode = pb::StepMode::ClosedLoop.into();
         };
         server.navigated(closed_loop).await.steps
     };
@@ -347,7 +358,7 @@ async fn equal_questions_have_equal_answers() {
     });
     let target = target.await;
 
-    let pose = target.places[0].frame.clone().unwrap().pose.unwrap();
+    let pose = target.frames[0].frame.clone().unwrap().pose.unwrap();
     assert_eq!(pose.parent_frame, "rooms/synthetic");
 
     let motion = one.displacement.unwrap();
@@ -396,8 +407,6 @@ async fn a_feature_answers_as_its_frame_does_but_knows_no_truth() {
         assert!(answer.steps[0].error.is_none() && answer.steps[0].requested_pose.is_none());
         assert!(answer.displacement.is_none());
     }
-
-    thresholds_are_met_below_them(frame_answer.steps[0].error.as_ref().unwrap());
 }
 
 /// Oracle: the contract of exclusion and of k, and that a list of motions is their composition.
@@ -440,13 +449,13 @@ async fn a_batch_answers_as_its_questions_do_and_one_failure_is_alone() {
     };
 
     let snap = pb::NavigateRequest {
-        mode: pb::Mode::Snap.into(),
+        step_mode: pb::StepMode::Snap.into(),
         steps: Some(4),
         ..question()
     };
     let results = server
         .client
-        .batch_navigate(vec![question(), bad, snap.clone()]);
+        .batch_navigate(vec![question(), bad.clone(), snap.clone()]);
     let results = results.await.unwrap();
 
     let alone = [
@@ -456,16 +465,24 @@ async fn a_batch_answers_as_its_questions_do_and_one_failure_is_alone() {
 
     let response = |result: &pb::BatchNavigateResult| match result.result.clone().unwrap() {
         pb::batch_navigate_result::Result::Response(response) => response,
-        pb::batch_navigate_result::Result::Failure(failure) => panic!("{}", failure.message),
+        pb::batch_navigate_result::Result::Error(error) => panic!("{}", error.message),
     };
 
     assert_eq!([response(&results[0]), response(&results[2])], alone);
 
-    let Some(pb::batch_navigate_result::Result::Failure(failure)) = &results[1].result else {
+    let Some(pb::batch_navigate_result::Result::Error(error)) = &results[1].result else {
         panic!("the second question names no room");
     };
 
-    assert_eq!(failure.code, i32::from(tonic::Code::NotFound));
+    // The status is the one that the question alone gets, details included.
+    let alone = server.client.navigate(bad).await.unwrap_err();
+    assert_eq!(error.code, i32::from(tonic::Code::NotFound));
+    let details = error.get_error_details();
+    assert_eq!(details.resource_info().unwrap().resource_type, "room");
+    assert_eq!(
+        details.error_info().map(|info| info.reason.clone()),
+        alone.reason()
+    );
 }
 
 /// Oracle: a frame's own feature is at distance 0 from it and nothing is nearer, in one room or in
@@ -478,9 +495,9 @@ async fn a_mapped_feature_is_found_in_its_room() {
         (r.view, r.top_k) = (feature(feature_row(123)), Some(5));
     });
     let answer = localized.await;
-    assert_eq!((answer.room_count, answer.places.len()), (2, 5));
+    assert_eq!((answer.room_count, answer.frames.len()), (2, 5));
 
-    let best = &answer.places[0];
+    let best = &answer.frames[0];
     let frame = best.frame.as_ref().unwrap();
     assert_eq!(best.room.as_ref().unwrap().name, "synthetic");
     assert_eq!(frame.frame_id, 123);
@@ -492,7 +509,7 @@ async fn a_mapped_feature_is_found_in_its_room() {
 async fn the_catalog_lists_what_the_store_has() {
     let server = start(Config::default()).await;
     let rooms = server.client.rooms().await.unwrap();
-    let names = rooms.iter().map(|room| room.revision.clone().unwrap().name);
+    let names = rooms.iter().map(|room| room.name.clone());
     let names: Vec<_> = names.collect();
     assert_eq!(names, ["synthetic", "synthetic_b"]);
 
@@ -500,9 +517,9 @@ async fn the_catalog_lists_what_the_store_has() {
     assert_eq!(rooms[0].adapters, ["oracle"]);
     assert_eq!(rooms[0].features[0].dim, 48);
 
-    let adapter = server.client.adapter("oracle").await.unwrap().unwrap();
+    let adapter = server.client.adapter("oracle").await.unwrap();
     assert_eq!((adapter.latent_dim, adapter.stride), (20, 40));
-    assert_eq!(adapter.split, "time");
+    assert_eq!(adapter.split(), pb::Split::Time);
 
     // A score without meaning is absent.
     assert_eq!(adapter.test.unwrap().direction, None);
@@ -539,4 +556,37 @@ async fn the_hnsw_index_answers_as_the_exact_one_here_and_says_what_it_is() {
         assert_eq!(a.steps, b.steps);
         assert!(a.exact && !b.exact);
     }
+}
+
+/// Oracle: the definitions of the splits, by hand: 600 frames, of which the last 120 test.
+#[tokio::test]
+async fn the_pairs_of_a_split_are_listed() {
+    let server = start(Config::default()).await;
+    let list = async |split: pb::Split, stride| {
+        let request = pb::ListPairsRequest {
+            room: "synthetic".to_owned(),
+            split: split.into(),
+            stride,
+            ..pb::ListPairsRequest::default()
+        };
+        server.client.list_pairs(request).await
+    };
+
+    // The adapter was trained with the time split and a stride of 40.
+    let pairs = list(pb::Split::Unspecified, None).await.unwrap();
+    assert_eq!((pairs.split(), pairs.stride), (pb::Split::Time, 40));
+    assert_eq!(pairs.test_sources, (480..560).collect::<Vec<_>>());
+    assert_eq!(pairs.test_targets, (520..600).collect::<Vec<_>>());
+    assert_eq!(pairs.training_sources, (0..440).collect::<Vec<_>>());
+    assert_eq!(pairs.training_targets, (40..480).collect::<Vec<_>>());
+    assert_eq!(pairs.candidates, (480..600).collect::<Vec<_>>());
+
+    // Blocks 2, 7, … of 50 frames: 100 to 149, 350 to 399.
+    let blocks = list(pb::Split::Blocks, Some(49)).await.unwrap();
+    assert_eq!(blocks.test_sources, [100, 350]);
+    assert_eq!(blocks.test_targets, [149, 399]);
+    assert!(blocks.candidates.contains(&100) && !blocks.candidates.contains(&150));
+
+    let error = list(pb::Split::Time, Some(120)).await.unwrap_err();
+    assert_eq!(error.field().as_deref(), Some("stride"), "{error}");
 }

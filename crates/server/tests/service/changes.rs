@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use pb::set_default_request::Default;
+use pb::catalog_default::Default;
 use seese3_client::proto::v1 as pb;
 use seese3_client::{Client, Error};
 use seese3_core::features::Features;
@@ -13,8 +13,8 @@ use sha2::{Digest, Sha256};
 use tonic::Code;
 
 use crate::harness::{
-    TestServer, Unfit, code_of, feature, features_of, filled_store, publish_oracle, question,
-    refused, room_of, start_on,
+    TestServer, Unfit, code_of, feature, features_of, filled_store, oracle_adapter, publish_oracle,
+    question, record, refused, room_of, start_on,
 };
 use crate::security::{client_with, principal};
 use seese3_testing::world;
@@ -72,7 +72,7 @@ impl Upload {
 
         Self {
             spec: pb::RoomUpload {
-                name: name.to_owned(),
+                room: name.to_owned(),
                 features: vec![pb::FeatureSource {
                     name: source.name.clone(),
                     dim: source.dim as u32,
@@ -104,8 +104,8 @@ impl Upload {
         digest.finalize().to_vec()
     }
 
-    fn messages(self) -> Vec<pb::CreateRoomRequest> {
-        use pb::create_room_request::Message;
+    fn messages(self) -> Vec<pb::UploadRoomRequest> {
+        use pb::upload_room_request::Message;
 
         let poses = self.batches.iter().map(|batch| batch.poses.len());
         let frame_count = poses.sum::<usize>() as u32 / 128;
@@ -119,15 +119,15 @@ impl Upload {
             .chain(batches)
             .chain(self.keypoints.into_iter().map(Message::Keypoints))
             .chain([Message::End(end)])
-            .map(|message| pb::CreateRoomRequest {
+            .map(|message| pb::UploadRoomRequest {
                 message: Some(message),
             })
             .collect()
     }
 
-    pub async fn send(self, client: &Client) -> Result<pb::CreateRoomResponse, Error> {
+    pub async fn send(self, client: &Client) -> Result<pb::UploadRoomResponse, Error> {
         client
-            .create_room(tokio_stream::iter(self.messages()))
+            .upload_room(tokio_stream::iter(self.messages()))
             .await
     }
 }
@@ -137,7 +137,7 @@ impl Upload {
 async fn an_uploaded_room_answers_as_one_from_the_disk() {
     let (server, store) = start_writable().await;
     let uploaded = async |is_new: bool| {
-        let upload = Upload::synthetic("rooms/uploaded");
+        let upload = Upload::synthetic("uploaded");
         let answer = upload.send(&server.client).await.unwrap();
         assert_eq!(answer.revision.unwrap().revision, 1);
         assert_eq!((answer.created, answer.served), (is_new, true));
@@ -168,16 +168,13 @@ async fn an_uploaded_room_answers_as_one_from_the_disk() {
 #[tokio::test]
 async fn unfit_uploads_are_refused_and_leave_nothing() {
     let (server, store) = start_writable().await;
-    let good = Upload::synthetic("rooms/bad");
+    let good = Upload::synthetic("bad");
 
     let cases: [Unfit<Upload>; 26] = [
-        (|u| u.spec.name = "bad".into(), "room.name"),
-        (|u| u.spec.name = "rooms/../x".into(), "room.name"),
-        (
-            |u| u.spec.name = "rooms/bad/revisions/1".into(),
-            "room.name",
-        ),
-        (|u| u.spec.name = "adapters/bad".into(), "room.name"),
+        (|u| u.spec.room = "../x".into(), "room.room"),
+        (|u| u.spec.room = "rooms/bad".into(), "room.room"),
+        (|u| u.spec.room = String::new(), "room.room"),
+        (|u| u.spec.mode = 77, "room.mode"),
         (|u| u.spec.features.clear(), "room.features"),
         (|u| u.spec.features[0].dim = 0, "room.features.dim"),
         (|u| u.spec.features[0].dim = u32::MAX, "room.features.dim"),
@@ -185,11 +182,8 @@ async fn unfit_uploads_are_refused_and_leave_nothing() {
             |u| u.spec.features[0].name = "a/b".into(),
             "room.features.name",
         ),
-        (
-            |u| u.spec.encode_for = "adapters/oracle".into(),
-            "room.encode_for",
-        ),
-        (|u| u.spec.licence = "x".repeat(2_000), "room.licence"),
+        (|u| u.spec.encode_for = "oracle".into(), "room.encode_for"),
+        (|u| u.spec.license = "x".repeat(2_000), "room.license"),
         (
             |u| {
                 u.spec.camera = Some(pb::CameraIntrinsics {
@@ -227,10 +221,7 @@ async fn unfit_uploads_are_refused_and_leave_nothing() {
             "frames.timestamps_ns",
         ),
         (|u| u.batches[1].frame_names.clear(), "frames.frame_names"),
-        (
-            |u| u.batches[1].sequences = vec![0; 100],
-            "frames.sequences",
-        ),
+        (|u| u.batches[1].segments = vec![0; 100], "frames.segments"),
         (
             |u| u.batches[2].features[0][..4].copy_from_slice(&f32::NAN.to_le_bytes()),
             "frames.features",
@@ -259,12 +250,12 @@ async fn unfit_uploads_are_refused_and_leave_nothing() {
         (messages[..2].to_vec(), "end"),
         (Vec::new(), "room"),
         (
-            vec![messages[0].clone(), pb::CreateRoomRequest { message: None }],
+            vec![messages[0].clone(), pb::UploadRoomRequest { message: None }],
             "message",
         ),
         ([&messages[..], &messages[1..2]].concat(), "message"),
     ] {
-        let answer = server.client.create_room(tokio_stream::iter(sent)).await;
+        let answer = server.client.upload_room(tokio_stream::iter(sent)).await;
         refused(field, answer, Code::InvalidArgument, field);
     }
 
@@ -291,11 +282,11 @@ async fn uploads_together_hold_no_more_than_they_may() {
     };
     let server = start_on(folder, store, config).await;
 
-    let refused = Upload::synthetic("rooms/large").send(&server.client).await;
+    let refused = Upload::synthetic("large").send(&server.client).await;
     assert_eq!(refused.unwrap_err().code(), Some(Code::ResourceExhausted));
 
     // What the refused one held is free again.
-    let mut small = Upload::synthetic("rooms/small");
+    let mut small = Upload::synthetic("small");
     small.batches.truncate(1);
     assert!(small.send(&server.client).await.unwrap().served);
 }
@@ -310,18 +301,18 @@ async fn a_change_that_is_sent_again_is_made_once() {
         upload
     };
 
-    let first = upload("rooms/new").send(&server.client).await.unwrap();
-    let again = upload("rooms/new").send(&server.client).await.unwrap();
+    let first = upload("new").send(&server.client).await.unwrap();
+    let again = upload("new").send(&server.client).await.unwrap();
     assert_eq!(first, again);
     assert!(again.created);
 
-    let other = upload("rooms/other").send(&server.client).await;
+    let other = upload("other").send(&server.client).await;
     refused("another room", other, Code::InvalidArgument, "request_id");
 
     let delete = pb::DeleteRoomRequest {
-        name: "rooms/new".to_owned(),
+        room: "new".to_owned(),
         request_id: "second".to_owned(),
-        validate_only: false,
+        ..pb::DeleteRoomRequest::default()
     };
     for _ in 0..2 {
         let deleted = server.client.delete_room(delete.clone()).await;
@@ -335,70 +326,162 @@ async fn a_change_that_is_sent_again_is_made_once() {
     assert_eq!(code_of(gone), Code::NotFound);
 }
 
-/// Oracle: by hand. The newest adapter answers until another one is chosen; what was chosen is
-/// taken back by one call; a chosen one cannot be removed.
+/// Oracle: by hand. The newest adapter answers until another one is chosen, and again after that
+/// choice is cleared; a chosen one cannot be removed.
 #[tokio::test]
-async fn defaults_are_chosen_and_taken_back() {
+async fn defaults_are_set_and_cleared() {
+    use pb::clear_default_request::Default as Cleared;
+
     let (server, store) = start_writable().await;
     publish_oracle(&store, "trial").await;
 
     let answering = async || server.navigated(|_| ()).await.adapter.unwrap().name;
-    let choose_for = |name: &str, default: Option<Default>| {
+    let set = |default: Option<Default>| {
         server.client.set_default(pb::SetDefaultRequest {
-            name: name.to_owned(),
-            default,
+            default: default.map(|default| pb::CatalogDefault {
+                default: Some(default),
+            }),
             ..pb::SetDefaultRequest::default()
         })
     };
-    let choose = |default| choose_for("rooms/synthetic", default);
-    let adapter = |name: &str| Some(Default::Adapter(name.to_owned()));
+    let clear = |default: Option<Cleared>| {
+        server.client.clear_default(pb::ClearDefaultRequest {
+            default,
+            ..pb::ClearDefaultRequest::default()
+        })
+    };
+    let adapter = |name: &str| {
+        Some(Default::RoomAdapter(pb::RoomAdapter {
+            room: "synthetic".to_owned(),
+            adapter: name.to_owned(),
+        }))
+    };
+    let room = || Some(Cleared::RoomAdapter("synthetic".to_owned()));
 
-    let defaults = choose(adapter("adapters/trial")).await.unwrap();
-    assert_eq!(defaults.len(), 1);
-    assert_eq!(defaults[0].name, "rooms/synthetic");
-    assert_eq!(defaults[0].adapter, "adapters/trial");
+    let defaults = set(adapter("trial")).await.unwrap();
+    let expected = pb::CatalogDefault {
+        default: adapter("trial"),
+    };
+    assert_eq!(defaults, [expected]);
     assert_eq!(answering().await, "trial");
 
-    assert_eq!(choose(None).await.unwrap(), []);
-    choose(adapter("adapters/trial")).await.unwrap();
-    choose(adapter("adapters/oracle")).await.unwrap();
+    set(adapter("oracle")).await.unwrap();
     assert_eq!(answering().await, "oracle");
-    let room = server.client.room("synthetic").await.unwrap().unwrap();
-    assert_eq!(room.adapters, ["oracle", "trial"]);
+    let served = server.client.room("synthetic").await.unwrap();
+    assert_eq!(served.adapters, ["oracle", "trial"]);
 
     let delete = |name: &str| {
         server.client.delete_adapter(pb::DeleteAdapterRequest {
-            name: name.to_owned(),
+            adapter: name.to_owned(),
             ..pb::DeleteAdapterRequest::default()
         })
     };
-    let chosen = delete("adapters/oracle").await;
+    let chosen = delete("oracle").await;
     assert_eq!(code_of(chosen), Code::FailedPrecondition);
 
-    let roll_back = pb::RollBackDefaultRequest::default();
-    let rolled_back = server.client.roll_back_default(roll_back).await.unwrap();
-    assert_eq!(rolled_back[0].adapter, "adapters/trial");
+    // Nothing chosen: the newest, and not what was chosen last. Another default stays.
+    let first = pb::Revision {
+        name: "synthetic".to_owned(),
+        revision: 1,
+    };
+    set(Some(Default::RoomRevision(first.clone())))
+        .await
+        .unwrap();
+    let left = clear(room()).await.unwrap();
+    let expected = pb::CatalogDefault {
+        default: Some(Default::RoomRevision(first)),
+    };
+    assert_eq!(left, [expected]);
     assert_eq!(answering().await, "trial");
-
-    // Nothing chosen: the newest, and not what was chosen last.
-    choose(adapter("adapters/oracle")).await.unwrap();
-    assert!(choose(None).await.unwrap().is_empty());
-    assert_eq!(answering().await, "trial");
-    assert_eq!(delete("adapters/trial").await.unwrap(), [1]);
+    let cleared = Some(Cleared::RoomRevision("synthetic".to_owned()));
+    assert_eq!(clear(cleared.clone()).await.unwrap(), []);
+    assert_eq!(
+        clear(cleared).await.unwrap(),
+        [],
+        "nothing is left to clear"
+    );
+    assert_eq!(delete("trial").await.unwrap(), [1]);
     assert_eq!(answering().await, "oracle");
 
-    for (name, default, field) in [
-        ("synthetic", adapter("adapters/oracle"), "name"),
-        ("rooms/synthetic", adapter("oracle"), "adapter"),
-        ("adapters/oracle", adapter("adapters/oracle"), "adapter"),
-        ("rooms/synthetic/revisions/1", None, "name"),
-    ] {
-        let answer = choose_for(name, default).await;
-        refused(name, answer, Code::InvalidArgument, field);
+    // A request that names nothing changes nothing.
+    set(adapter("oracle")).await.unwrap();
+    refused("set", set(None).await, Code::InvalidArgument, "default");
+    refused("clear", clear(None).await, Code::InvalidArgument, "default");
+    let unstated = Some(Default::RoomRevision(pb::Revision::default()));
+    let answer = set(unstated).await;
+    refused(
+        "unstated",
+        answer,
+        Code::InvalidArgument,
+        "default.room_revision",
+    );
+    let unknown = Some(Default::RoomRevision(pb::Revision {
+        name: "synthetic".to_owned(),
+        revision: 7,
+    }));
+    for unknown in [adapter("nobody"), unknown] {
+        assert_eq!(code_of(set(unknown).await), Code::NotFound);
     }
-    for unknown in [adapter("adapters/nobody"), Some(Default::Revision(7))] {
-        assert_eq!(code_of(choose(unknown).await), Code::NotFound);
+    assert_eq!(
+        store.defaults().await.unwrap().adapter("synthetic"),
+        Some("oracle")
+    );
+}
+
+/// Oracle: the protocol: no upload replaces what is stored unless it says so, and nothing is
+/// written then.
+#[tokio::test]
+async fn an_upload_replaces_nothing_unasked() {
+    let (server, store) = start_writable().await;
+    let newest = async || store.load_room("synthetic", None).await.unwrap().revision;
+    let shorter = |mode: pb::UploadMode, is_checked_only| {
+        let mut upload = Upload::synthetic("synthetic");
+        upload.batches.truncate(2);
+        upload.spec.mode = mode.into();
+        upload.spec.validate_only = is_checked_only;
+        upload
+    };
+
+    for mode in [pb::UploadMode::Unspecified, pb::UploadMode::Create] {
+        for is_checked_only in [true, false] {
+            let answer = shorter(mode, is_checked_only).send(&server.client).await;
+            let error = answer.unwrap_err();
+            assert_eq!(error.code(), Some(Code::AlreadyExists), "{error}");
+            assert_eq!(error.reason().as_deref(), Some("ALREADY_EXISTS"));
+            assert_eq!(newest().await, 1);
+        }
     }
+
+    let checked = shorter(pb::UploadMode::Replace, true);
+    assert!(
+        checked
+            .send(&server.client)
+            .await
+            .unwrap()
+            .revision
+            .is_none()
+    );
+    assert_eq!(newest().await, 1);
+    let replaced = shorter(pb::UploadMode::Replace, false);
+    let replaced = replaced.send(&server.client).await.unwrap();
+    assert_eq!(replaced.revision.unwrap().revision, 2);
+
+    // The same content again changes nothing, so it needs no permission.
+    let again = shorter(pb::UploadMode::Create, false);
+    let again = again.send(&server.client).await.unwrap();
+    assert_eq!(
+        (again.revision.unwrap().revision, again.created),
+        (2, false)
+    );
+
+    // There is nothing to replace or to extend.
+    for mode in [pb::UploadMode::Replace, pb::UploadMode::Extend] {
+        let mut upload = shorter(mode, false);
+        upload.spec.room = "nowhere".to_owned();
+        let answer = upload.send(&server.client).await;
+        assert_eq!(code_of(answer), Code::NotFound, "{mode:?}");
+    }
+    assert_eq!(store.rooms().await.unwrap().len(), 2);
 }
 
 /// Oracle: the adapter in the store that it came from; damage that the test does.
@@ -408,35 +491,75 @@ async fn an_adapter_moves_from_store_to_server() {
     let (_folder, other) = filled_store().await;
     let (manifest, weights) = other.adapter_files("oracle", None).await.unwrap();
 
-    let send = async |name: &str, manifest: Vec<u8>, parts: Vec<Vec<u8>>| {
-        use pb::publish_adapter_request::Message;
+    let send_as =
+        async |mode: pb::UploadMode, name: &str, manifest: Vec<u8>, parts: Vec<Vec<u8>>| {
+            use pb::upload_adapter_request::Message;
 
-        let upload = pb::AdapterUpload {
-            name: name.to_owned(),
-            manifest,
-            ..pb::AdapterUpload::default()
+            let upload = pb::AdapterUpload {
+                adapter: name.to_owned(),
+                mode: mode.into(),
+                manifest,
+                ..pb::AdapterUpload::default()
+            };
+            let parts = parts.into_iter().map(Message::Weights);
+            let messages = std::iter::once(Message::Adapter(upload)).chain(parts);
+            let messages = messages.map(|message| pb::UploadAdapterRequest {
+                message: Some(message),
+            });
+            let messages: Vec<_> = messages.collect();
+            server
+                .client
+                .upload_adapter(tokio_stream::iter(messages))
+                .await
         };
-        let parts = parts.into_iter().map(Message::Weights);
-        let messages = std::iter::once(Message::Adapter(upload)).chain(parts);
-        let messages = messages.map(|message| pb::PublishAdapterRequest {
-            message: Some(message),
-        });
-        let messages: Vec<_> = messages.collect();
-        server
-            .client
-            .publish_adapter(tokio_stream::iter(messages))
-            .await
+    let send = async |name: &str, manifest, parts| {
+        send_as(pb::UploadMode::Create, name, manifest, parts).await
     };
 
     let halves = weights.chunks(weights.len() / 2 + 1);
     let halves: Vec<Vec<u8>> = halves.map(<[u8]>::to_vec).collect();
-    let answer = send("adapters/copy", manifest.clone(), halves.clone()).await;
+    let answer = send("copy", manifest.clone(), halves.clone()).await;
     let answer = answer.unwrap();
     assert!(answer.created && answer.served);
 
+    // Another adapter of the same name is not replaced unasked.
+    let (_folder, third) = filled_store().await;
+    let features = features_of("synthetic");
+    let (adapter, mut record) = (oracle_adapter(), record());
+    record.config.seed += 1;
+    let published = third.publish_adapter("other", &adapter, &record, features.rows());
+    published.await.unwrap();
+    let (other_manifest, other_weights) = third.adapter_files("other", None).await.unwrap();
+    let parts = || vec![other_weights.clone()];
+    let answer = send("copy", other_manifest.clone(), parts()).await;
+    assert_eq!(code_of(answer), Code::AlreadyExists);
+    for (mode, name, code) in [
+        (pb::UploadMode::Replace, "nobody", Code::NotFound),
+        (pb::UploadMode::Extend, "copy", Code::InvalidArgument),
+        (pb::UploadMode::Replace, "copy", Code::Ok),
+    ] {
+        let answer = send_as(mode, name, other_manifest.clone(), parts()).await;
+        assert_eq!(code_of(answer), code, "{name}");
+    }
+    let back = send_as(
+        pb::UploadMode::Replace,
+        "copy",
+        manifest.clone(),
+        halves.clone(),
+    )
+    .await;
+    assert_eq!(back.unwrap().revision.unwrap().revision, 3);
+
     let original = server.navigated(|r| r.adapter = "oracle".to_owned()).await;
     let copy = server.navigated(|r| r.adapter = "copy".to_owned()).await;
-    assert_eq!(original.steps, copy.steps);
+    // Only the adapters of the latents differ.
+    let unnamed = |mut step: pb::NavigationStep| {
+        step.latent.as_mut().unwrap().adapter = None;
+        step
+    };
+    let [original, copy] = [original, copy].map(|answer| answer.steps);
+    let original = original.into_iter().map(unnamed);
+    assert!(original.eq(copy.into_iter().map(unnamed)));
 
     let mut altered = weights.clone();
     let middle = altered.len() / 2;
@@ -448,13 +571,13 @@ async fn an_adapter_moves_from_store_to_server() {
     let long = vec![[&weights[..], &[0]].concat()];
     let whole = &manifest[..];
     for (name, manifest, parts, field) in [
-        ("adapters/x", whole, &vec![altered], "adapter.manifest"),
-        ("adapters/x", &altered_manifest, &halves, "adapter.manifest"),
-        ("adapters/x", b"{}", &halves, "adapter.manifest"),
-        ("adapters/x", whole, &short, "weights"),
-        ("adapters/x", whole, &long, "weights"),
-        ("rooms/x", whole, &halves, "adapter.name"),
-        ("adapters/..", whole, &halves, "adapter.name"),
+        ("x", whole, &vec![altered], "adapter.manifest"),
+        ("x", &altered_manifest, &halves, "adapter.manifest"),
+        ("x", b"{}", &halves, "adapter.manifest"),
+        ("x", whole, &short, "weights"),
+        ("x", whole, &long, "weights"),
+        ("adapters/x", whole, &halves, "adapter.adapter"),
+        ("..", whole, &halves, "adapter.adapter"),
     ] {
         let answer = send(name, manifest.to_vec(), parts.clone()).await;
         refused(name, answer, Code::InvalidArgument, field);
@@ -474,17 +597,17 @@ async fn a_room_is_fitted_on_the_server() {
         .unwrap();
     let server = start_on(folder, store, writable()).await;
 
-    let request = pb::RefitRoomRequest {
-        name: "rooms/hall".to_owned(),
+    let request = pb::FitAdapterRequest {
+        room: "hall".to_owned(),
         request_id: "fit".to_owned(),
-        ..pb::RefitRoomRequest::default()
+        ..pb::FitAdapterRequest::default()
     };
     let mut steps = 0;
-    let counted = |step: pb::RefitProgress| {
+    let counted = |step: pb::FitProgress| {
         steps += 1;
         assert!((0..=step.total).contains(&step.done));
     };
-    let result = server.client.refit_room(request.clone(), counted).await;
+    let result = server.client.fit_adapter(request.clone(), counted).await;
     let result = result.unwrap();
     assert!(result.created && result.served && steps > 0);
     let revision = result.revision.as_ref().unwrap();
@@ -498,36 +621,36 @@ async fn a_room_is_fitted_on_the_server() {
 
     // The same again is answered from memory, without a fit.
     let mut steps = 0;
-    let again = server.client.refit_room(request.clone(), |_| steps += 1);
+    let again = server.client.fit_adapter(request.clone(), |_| steps += 1);
     assert_eq!((again.await.unwrap(), steps), (result, 0));
 
-    let seeded = pb::RefitRoomRequest {
+    let seeded = pb::FitAdapterRequest {
         seed: u64::MAX,
         ..request.clone()
     };
-    let answer = server.client.refit_room(seeded, |_| ()).await;
+    let answer = server.client.fit_adapter(seeded, |_| ()).await;
     refused("another seed", answer, Code::InvalidArgument, "seed");
 
-    let cases: [(fn(&mut pb::RefitRoomRequest), _, _); 3] = [
-        (|r| r.name = "rooms/nowhere".into(), Code::NotFound, "room"),
+    let cases: [(fn(&mut pb::FitAdapterRequest), _, _); 3] = [
+        (|r| r.room = "nowhere".into(), Code::NotFound, "room"),
         (
             |r| r.features = "none".into(),
             Code::InvalidArgument,
             "features",
         ),
         (
-            |r| r.base_adapter = "adapters/hall.made-up.fitted".into(),
+            |r| r.base_adapter = "hall.made-up.fitted".into(),
             Code::InvalidArgument,
             "base_adapter",
         ),
     ];
     for (spoil, code, field) in cases {
-        let mut request = pb::RefitRoomRequest {
+        let mut request = pb::FitAdapterRequest {
             request_id: String::new(),
             ..request.clone()
         };
         spoil(&mut request);
-        let answer = server.client.refit_room(request, |_| ()).await;
+        let answer = server.client.fit_adapter(request, |_| ()).await;
         refused(field, answer, code, field);
     }
 }
@@ -537,7 +660,7 @@ async fn a_room_is_fitted_on_the_server() {
 async fn only_those_who_may_change_what_they_may() {
     let (folder, store) = filled_store().await;
     let closed = start_on(folder, store, Config::default()).await;
-    let refused = Upload::synthetic("rooms/new").send(&closed.client).await;
+    let refused = Upload::synthetic("new").send(&closed.client).await;
     assert_eq!(refused.unwrap_err().code(), Some(Code::FailedPrecondition));
 
     let (folder, store) = filled_store().await;
@@ -559,18 +682,18 @@ async fn only_those_who_may_change_what_they_may() {
         code_of(Upload::synthetic(room).send(&client).await)
     };
     for (caller, room, expected) in [
-        (None, "rooms/new-1", Code::Unauthenticated),
-        (Some("reader"), "rooms/new-1", Code::PermissionDenied),
-        (Some("mover"), "rooms/new-1", Code::Ok),
-        (Some("mover"), "rooms/old", Code::PermissionDenied),
-        (Some("writer"), "rooms/old", Code::Ok),
+        (None, "new-1", Code::Unauthenticated),
+        (Some("reader"), "new-1", Code::PermissionDenied),
+        (Some("mover"), "new-1", Code::Ok),
+        (Some("mover"), "old", Code::PermissionDenied),
+        (Some("writer"), "old", Code::Ok),
     ] {
         assert_eq!(outcome(caller, room).await, expected, "{caller:?} {room}");
     }
 
     // Adapters answer everywhere, so they are for those who see every room.
     let delete = pb::DeleteAdapterRequest {
-        name: "adapters/oracle".to_owned(),
+        adapter: "oracle".to_owned(),
         ..pb::DeleteAdapterRequest::default()
     };
     for (caller, expected) in [("mover", Code::PermissionDenied), ("writer", Code::Ok)] {
@@ -591,13 +714,26 @@ async fn many_changes_at_once_are_made_or_refused() {
     for number in 0..600 {
         let client = server.client.clone();
         changes.spawn(async move {
-            let default = match number % 2 {
-                0 => None,
-                _ => Some(Default::Revision(1)),
+            let revision = pb::Revision {
+                name: "synthetic".to_owned(),
+                revision: 1,
             };
+            if number % 2 == 0 {
+                let cleared = pb::clear_default_request::Default::RoomRevision(revision.name);
+                return code_of(
+                    client
+                        .clear_default(pb::ClearDefaultRequest {
+                            default: Some(cleared),
+                            ..pb::ClearDefaultRequest::default()
+                        })
+                        .await,
+                );
+            }
+            let default = Default::RoomRevision(revision);
             let request = pb::SetDefaultRequest {
-                name: "rooms/synthetic".to_owned(),
-                default,
+                default: Some(pb::CatalogDefault {
+                    default: Some(default),
+                }),
                 ..pb::SetDefaultRequest::default()
             };
             code_of(client.set_default(request).await)
@@ -619,7 +755,7 @@ async fn many_changes_at_once_are_made_or_refused() {
 async fn a_caller_that_goes_away_leaves_its_change() {
     let (server, store) = start_writable().await;
     let upload = || {
-        let mut upload = Upload::synthetic("rooms/left");
+        let mut upload = Upload::synthetic("left");
         upload.spec.request_id = "left".to_owned();
         upload
     };

@@ -1,8 +1,8 @@
 //! A robot adds frames to the room that it drives in.
 
 use seese3_client::proto::v1 as pb;
-use seese3_client::proto::v1::create_room_request::Message;
 use seese3_client::proto::v1::track_response::Answer;
+use seese3_client::proto::v1::upload_room_request::Message;
 use seese3_core::geometry::PoseError;
 use seese3_server::{Config, TokenKey};
 use sha2::{Digest, Sha256};
@@ -24,13 +24,13 @@ async fn server() -> TestServer {
 /// What adds frames to the hall.
 fn extension() -> pb::RoomUpload {
     pb::RoomUpload {
-        name: "rooms/hall".to_owned(),
+        room: "hall".to_owned(),
         features: vec![pb::FeatureSource {
             name: "made-up".to_owned(),
             dim: served("hall").1.source().dim as u32,
             ..pb::FeatureSource::default()
         }],
-        extend: true,
+        mode: pb::UploadMode::Extend.into(),
         ..pb::RoomUpload::default()
     }
 }
@@ -41,7 +41,7 @@ async fn send(
     upload: pb::RoomUpload,
     place: &str,
     rows: std::ops::Range<usize>,
-) -> Result<pb::CreateRoomResponse, seese3_client::Error> {
+) -> Result<pb::UploadRoomResponse, seese3_client::Error> {
     let (room, features) = served(place);
     let poses = rows.clone().flat_map(|row| {
         let matrix = room.poses()[row].to_homogeneous().transpose();
@@ -71,12 +71,12 @@ async fn send(
         Message::Frames(batch),
         Message::End(end),
     ];
-    let messages = messages.map(|message| pb::CreateRoomRequest {
+    let messages = messages.map(|message| pb::UploadRoomRequest {
         message: Some(message),
     });
     server
         .client
-        .create_room(tokio_stream::iter(messages))
+        .upload_room(tokio_stream::iter(messages))
         .await
 }
 
@@ -89,17 +89,17 @@ async fn streams_and_tokens_survive_the_growth_of_a_room() {
     let first = answers(&server, before).await.unwrap();
     let token = first[60].resume_token.clone();
 
-    let fit = || pb::RefitRoomRequest {
-        name: "rooms/hall".to_owned(),
-        ..pb::RefitRoomRequest::default()
+    let fit = || pb::FitAdapterRequest {
+        room: "hall".to_owned(),
+        ..pb::FitAdapterRequest::default()
     };
-    server.client.refit_room(fit(), |_| ()).await.unwrap();
+    server.client.fit_adapter(fit(), |_| ()).await.unwrap();
 
     // The attic's frames stand for a part of the hall that was not mapped.
     let answer = send(&server, extension(), "attic", 0..80).await.unwrap();
     assert_eq!(answer.revision.unwrap().revision, 2);
     assert!(answer.created && answer.served);
-    let room = server.client.room("hall").await.unwrap().unwrap();
+    let room = server.client.room("hall").await.unwrap();
     assert_eq!(room.frame_count, 380);
 
     // Rules that were measured in the smaller room tell nothing of the larger one, until the next
@@ -114,7 +114,7 @@ async fn streams_and_tokens_survive_the_growth_of_a_room() {
         server.client.localize(request).await.unwrap().fitted
     };
     assert!(located().await.is_none());
-    server.client.refit_room(fit(), |_| ()).await.unwrap();
+    server.client.fit_adapter(fit(), |_| ()).await.unwrap();
     assert!(located().await.is_some());
 
     let localized = server
@@ -127,7 +127,7 @@ async fn streams_and_tokens_survive_the_growth_of_a_room() {
         })
         .await
         .unwrap();
-    assert_eq!(localized.places[0].frame.as_ref().unwrap().frame_id, 340);
+    assert_eq!(localized.frames[0].frame.as_ref().unwrap().frame_id, 340);
 
     let rest = followed(resume(token), 60..120);
     let rest = answers(&server, rest).await.unwrap();
@@ -139,7 +139,7 @@ async fn streams_and_tokens_survive_the_growth_of_a_room() {
         assert_eq!(update.status, pb::TrackStatus::Tracking as i32, "{row}");
         assert_eq!(update.room.as_ref().unwrap().revision, 2);
 
-        let pose = update.map_from_camera.clone().unwrap();
+        let pose = update.map_from_camera().cloned().unwrap();
         let pose = seese3_client::convert::pose(&pose).unwrap();
         let error = PoseError::between(&hall.poses()[row], &pose);
         assert!(error.translation_m < 0.1, "{row}: {error:?}");
@@ -154,7 +154,7 @@ async fn unfit_extensions_are_refused_and_leave_the_room() {
     let cases = [
         (
             pb::RoomUpload {
-                name: "rooms/cellar".to_owned(),
+                room: "cellar".to_owned(),
                 ..upload()
             },
             Code::NotFound,
@@ -162,15 +162,15 @@ async fn unfit_extensions_are_refused_and_leave_the_room() {
         ),
         (
             pb::RoomUpload {
-                licence: "CC0".to_owned(),
+                license: "CC0".to_owned(),
                 ..upload()
             },
             Code::InvalidArgument,
-            "room.licence",
+            "room.license",
         ),
         (
             pb::RoomUpload {
-                extend: false,
+                mode: pb::UploadMode::Replace.into(),
                 drop_other_features: true,
                 ..upload()
             },

@@ -15,7 +15,7 @@ use seese3_server::Config;
 use seese3_store::{BaseAdapter, RoomFit, Store};
 use tonic::Code;
 
-use crate::harness::{TestServer, feature, frame, latent, refused, start_on, until};
+use crate::harness::{TestServer, feature, frame, latent_of, refused, start_on, until};
 use seese3_testing::world::{calibrated, served};
 
 /// The places hall and attic, an adapter of both, and one that goes on from it in the hall.
@@ -103,7 +103,8 @@ async fn a_view_is_located_in_the_room_of_its_adapter() {
         );
         assert_eq!(located.covariance.len(), 36);
         assert_eq!(fitted.frame_id as usize, row);
-        assert!(["fitted", "zero-shot", "nearest-frame"].contains(&&*fitted.translation_reader));
+        let estimator = fitted.translation_estimator();
+        assert_ne!(estimator, pb::RelativeEstimator::Unspecified);
         assert!((0.0..=1.0).contains(&fitted.rotation_gain));
         assert_eq!(answer.room.unwrap().name, "hall");
         assert!(answer.novelty.unwrap() <= 1.0 && answer.reason.is_empty());
@@ -124,31 +125,26 @@ async fn a_view_is_located_in_the_room_of_its_adapter() {
     );
 }
 
-/// Oracle: the promise of NavigateTo: nothing is planned for a view that tells no place. An adapter
+/// Oracle: the promise of PlanRoute: nothing is planned for a view that tells no place. An adapter
 /// that was fitted to a room and calibrated nowhere knows that too.
 #[tokio::test]
 async fn a_fitted_adapter_starts_no_way_from_elsewhere() {
-    use pb::navigate_to_request::Goal;
+    use pb::plan_route_request::Goal;
 
     let server = server().await;
     let ask = async |values: Vec<f32>| {
-        let asked = pb::NavigateToRequest {
+        let asked = pb::PlanRouteRequest {
             room: "hall".to_owned(),
             source: feature(values),
             goal: Some(Goal::GoalFrameId(120)),
             ..Default::default()
         };
-        server.client.navigate_to(asked, |_| ()).await.unwrap()
+        server.client.plan_route(asked).await.unwrap()
     };
 
     let own = ask(served("hall").1.rows().row(40).to_vec()).await;
-    assert_eq!(own.adapter.unwrap().name, "hall.fitted");
-    assert_eq!(
-        own.outcome,
-        pb::NavigateToOutcome::Reached as i32,
-        "{}",
-        own.message
-    );
+    assert_eq!(own.adapter.as_ref().unwrap().name, "hall.fitted");
+    assert_eq!(own.outcome(), pb::RouteOutcome::Found, "{}", own.message);
     assert!(
         own.arrival_probability
             .is_some_and(|probability| probability > 0.5)
@@ -163,7 +159,7 @@ async fn a_fitted_adapter_starts_no_way_from_elsewhere() {
         let answer = ask(elsewhere).await;
         assert_eq!(
             answer.outcome(),
-            pb::NavigateToOutcome::StartUnknown,
+            pb::RouteOutcome::StartUnknown,
             "{}",
             answer.message
         );
@@ -232,7 +228,7 @@ async fn a_fitted_room_is_relocalised_by_its_own_adapter() {
     assert!(error.translation_m < 0.05, "{error:?}");
 
     let row = features.rows().row(100).to_vec();
-    let view = latent(calibrated().0.embed_one(&row).unwrap().to_vec());
+    let view = latent_of("base", calibrated().0.embed_one(&row).unwrap().to_vec());
     let found = server.client.relocalize(ask(view)).await.unwrap();
     assert!(found.rooms.iter().all(|room| room.fitted.is_none()));
 }
@@ -316,13 +312,13 @@ async fn an_evaluation_takes_an_adapter_that_has_not_seen_the_test_frames() {
     )
     .await
     .unwrap();
-    assert_eq!(report.adapter.unwrap().name, "held-out");
-    assert_eq!((report.split.as_str(), report.stride), ("time", 10));
+    assert_eq!(report.adapter.as_ref().unwrap().name, "held-out");
+    assert_eq!((report.split(), report.stride), (pb::Split::Time, 10));
     assert!(!report.leaks && report.in_room);
 
     // The same adapter has seen test frames of another split.
     let of_another_split = pb::EvaluateRequest {
-        split: "blocks".to_owned(),
+        split: pb::Split::Blocks.into(),
         ..request()
     };
     let leaking = client.evaluate(of_another_split, |_| ()).await;

@@ -10,7 +10,9 @@ use seese3_encoder::{Bounds, decode, encode_png};
 use seese3_server::Config;
 use tonic::Code;
 
-use crate::harness::{feature, features_of, filled_store, frame, room_of, start, start_on};
+use crate::harness::{
+    feature, features_of, filled_store, frame, refused, room_of, start, start_on,
+};
 
 /// Oracle: the recorded poses, and a search of all pairs by the definition.
 #[tokio::test]
@@ -26,7 +28,7 @@ async fn a_room_lists_its_frames_and_their_neighbours() {
         .await
         .unwrap();
     assert_eq!(frames.len(), poses.len());
-    assert!(frames.iter().any(|frame| frame.neighbours.len() > 2));
+    assert!(frames.iter().any(|frame| frame.neighbors.len() > 2));
 
     for (row, found) in frames.iter().enumerate() {
         assert_eq!(found.frame_id as usize, row);
@@ -36,10 +38,10 @@ async fn a_room_lists_its_frames_and_their_neighbours() {
         let near =
             |other: &usize| *other != row && body_twist(&poses[row], &poses[*other]).norm() <= HOP;
         let expected = (0..poses.len()).filter(near).count();
-        assert_eq!(found.neighbours.len(), expected.min(32), "frame {row}");
+        assert_eq!(found.neighbors.len(), expected.min(32), "frame {row}");
 
         let mut before = 0.0;
-        for neighbour in &found.neighbours {
+        for neighbour in &found.neighbors {
             let motion = convert::twist(neighbour.motion.as_ref().unwrap()).unwrap();
             let motion = Twist {
                 linear: motion.linear,
@@ -54,7 +56,7 @@ async fn a_room_lists_its_frames_and_their_neighbours() {
     }
 
     let plain = server.client.frames("synthetic", None, None).await.unwrap();
-    assert!(plain.iter().all(|frame| frame.neighbours.is_empty()));
+    assert!(plain.iter().all(|frame| frame.neighbors.is_empty()));
 
     for (hop, room, code) in [
         (Some(0.0), "synthetic", Code::InvalidArgument),
@@ -76,9 +78,10 @@ async fn frames_come_page_by_page() {
     let mut page = async |page_size: i32, page_token: &str| {
         let asked = pb::ListFramesRequest {
             room: "synthetic".to_owned(),
+            room_revision: None,
             page_size,
             page_token: page_token.to_owned(),
-            neighbours_within: None,
+            neighbors_within: None,
             thumbnail_width: None,
         };
         service
@@ -208,7 +211,7 @@ async fn a_latent_stands_for_its_view() {
     let row = features_of("synthetic").rows().row(77).to_vec();
     let room = "synthetic".to_owned();
     let served = server.client.room("synthetic").await.unwrap();
-    let adapter = served.unwrap().adapters[0].clone();
+    let adapter = served.adapters[0].clone();
 
     let encoded = server
         .client
@@ -217,6 +220,7 @@ async fn a_latent_stands_for_its_view() {
             room: room.clone(),
             views: vec![feature(row.clone()).unwrap(), frame(77).unwrap()],
             with_features: true,
+            ..pb::EncodeRequest::default()
         })
         .await
         .unwrap();
@@ -233,14 +237,55 @@ async fn a_latent_stands_for_its_view() {
             top_k: Some(5),
             ..Default::default()
         };
-        server.client.localize(asked).await.unwrap().places
+        server.client.localize(asked).await.unwrap().frames
     };
     let latent = pb::View {
         view: Some(pb::view::View::Latent(
             encoded.views[0].latent.clone().unwrap(),
         )),
     };
-    assert_eq!(localize(feature(row)).await, localize(Some(latent)).await);
+    let of_feature = localize(feature(row)).await;
+    assert_eq!(of_feature, localize(Some(latent.clone())).await);
+
+    // The latent names its adapter, so that no default can be taken for it.
+    let ask = async |view: pb::View, adapter: &str| {
+        let asked = pb::LocalizeRequest {
+            rooms: vec![room.clone()],
+            adapter: adapter.to_owned(),
+            view: Some(view),
+            top_k: Some(5),
+            ..Default::default()
+        };
+        server.client.localize(asked).await
+    };
+    let unnamed = ask(latent.clone(), "").await.unwrap();
+    assert_eq!(unnamed.frames, of_feature);
+    let altered = |alter: fn(&mut Option<pb::Revision>)| {
+        let mut latent = encoded.views[0].latent.clone().unwrap();
+        alter(&mut latent.adapter);
+        pb::View {
+            view: Some(pb::view::View::Latent(latent)),
+        }
+    };
+    let anonymous = altered(|adapter| *adapter = None);
+    assert!(ask(anonymous.clone(), &adapter).await.is_ok());
+    refused(
+        "no adapter",
+        ask(anonymous, "").await,
+        Code::InvalidArgument,
+        "adapter",
+    );
+    let of_another = altered(|adapter| adapter.as_mut().unwrap().name = "other".to_owned());
+    let of_next = altered(|adapter| adapter.as_mut().unwrap().revision = 2);
+    for view in [of_another, of_next] {
+        let answer = ask(view, &adapter).await;
+        refused(
+            "another adapter",
+            answer,
+            Code::InvalidArgument,
+            "view.latent.adapter",
+        );
+    }
 
     let bad = |views: Vec<pb::View>| pb::EncodeRequest {
         adapter: adapter.clone(),

@@ -283,9 +283,22 @@ pub fn feature(values: Vec<f32>) -> Option<pb::View> {
     })
 }
 
+/// A latent of the adapter `oracle`.
 pub fn latent(values: Vec<f64>) -> Option<pb::View> {
+    latent_of("oracle", values)
+}
+
+/// A latent of the first revision of an adapter.
+pub fn latent_of(adapter: &str, values: Vec<f64>) -> Option<pb::View> {
+    let adapter = pb::Revision {
+        name: adapter.to_owned(),
+        revision: 1,
+    };
     Some(pb::View {
-        view: Some(pb::view::View::Latent(pb::Latent { values })),
+        view: Some(pb::view::View::Latent(pb::Latent {
+            values,
+            adapter: Some(adapter),
+        })),
     })
 }
 

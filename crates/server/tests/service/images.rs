@@ -147,7 +147,7 @@ async fn an_image_is_answered_as_its_frame_is() {
         .localize(request)
         .await
         .unwrap()
-        .places
+        .frames
         .remove(0)
         .frame
         .unwrap();
@@ -192,8 +192,8 @@ async fn an_image_is_answered_as_its_frame_is() {
         .motion
         .unwrap();
 
-    let a = by_image.linear.unwrap();
-    let b = by_frame.linear.unwrap();
+    let a = by_image.twist.unwrap().linear.unwrap();
+    let b = by_frame.twist.unwrap().linear.unwrap();
     for (a, b) in [(a.x, b.x), (a.y, b.y), (a.z, b.z)] {
         near("v", a, b, 1e-5);
     }
@@ -298,7 +298,7 @@ async fn an_encoder_that_is_not_there_ends_the_server() {
 /// Oracle: PNG is lossless, so that a room of uploaded images is the room of their features.
 #[tokio::test]
 async fn a_room_can_be_uploaded_as_images() {
-    use pb::create_room_request::Message;
+    use pb::upload_room_request::Message;
 
     let config = Config {
         writable: true,
@@ -325,8 +325,8 @@ async fn a_room_can_be_uploaded_as_images() {
         batch.images.iter().for_each(|image| digest.update(image));
         let messages = [
             Message::Room(pb::RoomUpload {
-                name: "rooms/uploaded".to_owned(),
-                encode_for: "adapters/eyes".to_owned(),
+                room: "uploaded".to_owned(),
+                encode_for: "eyes".to_owned(),
                 ..pb::RoomUpload::default()
             }),
             Message::Frames(batch),
@@ -335,10 +335,10 @@ async fn a_room_can_be_uploaded_as_images() {
                 sha256: digest.finalize().to_vec(),
             }),
         ];
-        let messages = messages.map(|message| pb::CreateRoomRequest {
+        let messages = messages.map(|message| pb::UploadRoomRequest {
             message: Some(message),
         });
-        server.client.create_room(tokio_stream::iter(messages))
+        server.client.upload_room(tokio_stream::iter(messages))
     };
 
     for alter in [

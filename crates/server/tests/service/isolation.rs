@@ -43,19 +43,21 @@ pub async fn server(config: Config, extra: &str) -> TestServer {
     start_on(folder, store, config).await
 }
 
-fn refit(room: &str) -> pb::RefitRoomRequest {
-    pb::RefitRoomRequest {
-        name: format!("rooms/{room}"),
-        ..pb::RefitRoomRequest::default()
+fn refit(room: &str) -> pb::FitAdapterRequest {
+    pb::FitAdapterRequest {
+        room: room.to_owned(),
+        ..pb::FitAdapterRequest::default()
     }
 }
 
 async fn set_adapter(client: &Client, room: &str, adapter: &str) -> Result<(), Error> {
     let request = pb::SetDefaultRequest {
-        name: format!("rooms/{room}"),
-        default: Some(pb::set_default_request::Default::Adapter(format!(
-            "adapters/{adapter}"
-        ))),
+        default: Some(pb::CatalogDefault {
+            default: Some(pb::catalog_default::Default::RoomAdapter(pb::RoomAdapter {
+                room: room.to_owned(),
+                adapter: adapter.to_owned(),
+            })),
+        }),
         ..pb::SetDefaultRequest::default()
     };
     client.set_default(request).await.map(drop)
@@ -68,7 +70,10 @@ async fn hidden_adapters_are_answered_like_missing_ones() {
     let server = server(Config::default(), "").await;
     let operator = client_with(&server, Some("operator")).await;
     let lab = client_with(&server, Some("lab")).await;
-    let fitted = operator.refit_room(refit("kitchen"), |_| ()).await.unwrap();
+    let fitted = operator
+        .fit_adapter(refit("kitchen"), |_| ())
+        .await
+        .unwrap();
     let hidden = fitted.revision.unwrap().name;
     assert_eq!(hidden, "kitchen.made-up.fitted");
 
@@ -79,17 +84,18 @@ async fn hidden_adapters_are_answered_like_missing_ones() {
     };
     assert_eq!(chosen(&hidden).await, chosen(missing).await);
     let fitted_from = async |adapter: &str| {
-        let request = pb::RefitRoomRequest {
-            base_adapter: format!("adapters/{adapter}"),
+        let request = pb::FitAdapterRequest {
+            base_adapter: adapter.to_owned(),
             ..refit("lab")
         };
-        let error = lab.refit_room(request, |_| ()).await.unwrap_err();
+        let error = lab.fit_adapter(request, |_| ()).await.unwrap_err();
         (error.code(), error.to_string().replace(adapter, "NAME"))
     };
     assert_eq!(fitted_from(&hidden).await, fitted_from(missing).await);
 
     let unfit = set_adapter(&operator, "lab", &hidden).await;
-    refused("of another room", unfit, Code::InvalidArgument, "adapter");
+    let field = "default.room_adapter.adapter";
+    refused("of another room", unfit, Code::InvalidArgument, field);
     set_adapter(&lab, "lab", "base").await.unwrap();
 
     for (name, is_free) in [
@@ -98,11 +104,11 @@ async fn hidden_adapters_are_answered_like_missing_ones() {
         ("lab.b.mine.fitted", false),
         ("kitchen.mine", false),
     ] {
-        let request = pb::RefitRoomRequest {
-            fitted_adapter: format!("adapters/{name}"),
+        let request = pb::FitAdapterRequest {
+            fitted_adapter: name.to_owned(),
             ..refit("lab")
         };
-        let answer = lab.refit_room(request, |_| ()).await;
+        let answer = lab.fit_adapter(request, |_| ()).await;
         if is_free {
             assert_eq!(answer.unwrap().revision.unwrap().name, name);
         } else {
@@ -117,12 +123,15 @@ async fn a_caller_deletes_its_own_adapters() {
     let server = server(Config::default(), "").await;
     let operator = client_with(&server, Some("operator")).await;
     let lab = client_with(&server, Some("lab")).await;
-    operator.refit_room(refit("kitchen"), |_| ()).await.unwrap();
-    lab.refit_room(refit("lab"), |_| ()).await.unwrap();
+    operator
+        .fit_adapter(refit("kitchen"), |_| ())
+        .await
+        .unwrap();
+    lab.fit_adapter(refit("lab"), |_| ()).await.unwrap();
 
     let delete = async |adapter: &str| {
         let request = pb::DeleteAdapterRequest {
-            name: format!("adapters/{adapter}"),
+            adapter: adapter.to_owned(),
             ..pb::DeleteAdapterRequest::default()
         };
         lab.delete_adapter(request).await
@@ -144,15 +153,15 @@ async fn a_fit_ends_with_its_caller() {
     let client = lab.clone();
     let fit = tokio::spawn(async move {
         client
-            .refit_room(refit("lab"), |step| _ = began.send(step))
+            .fit_adapter(refit("lab"), |step| _ = began.send(step))
             .await
     });
     begins.recv().await.unwrap();
-    let second = lab.refit_room(refit("lab"), |_| ()).await;
+    let second = lab.fit_adapter(refit("lab"), |_| ()).await;
     assert_eq!(second.unwrap_err().code(), Some(Code::ResourceExhausted));
 
     fit.abort();
-    let again = async || lab.refit_room(refit("lab"), |_| ()).await;
+    let again = async || lab.fit_adapter(refit("lab"), |_| ()).await;
     let fitted = until("the place is free", again, |answer| match answer {
         Ok(_) => true,
         Err(error) => {
@@ -181,8 +190,13 @@ async fn quotas_bound_rooms_and_callers() {
     );
     let upload = async |client: &Client, room: &str, frames: usize| {
         let (whole, features) = world::served("lab");
-        let mut upload = Upload::of(&format!("rooms/{room}"), &whole, &features);
+        let mut upload = Upload::of(room, &whole, &features);
         upload.batches.truncate(frames / 100);
+        let is_known = operator.room(room).await.is_ok();
+        upload.spec.mode = match is_known {
+            true => pb::UploadMode::Replace.into(),
+            false => pb::UploadMode::Create.into(),
+        };
         upload
             .send(client)
             .await
@@ -204,7 +218,7 @@ async fn quotas_bound_rooms_and_callers() {
 
     for room in ["lab-2", "lab-3"] {
         let request = pb::DeleteRoomRequest {
-            name: format!("rooms/{room}"),
+            room: room.to_owned(),
             ..pb::DeleteRoomRequest::default()
         };
         small.delete_room(request).await.unwrap();

@@ -89,13 +89,13 @@ async fn uploaded_keypoints_are_stored_as_those_from_the_disk() {
     };
     store.publish_contents(contents).await.unwrap();
 
-    let mut checked = upload("rooms/there");
+    let mut checked = upload("there");
     checked.spec.validate_only = true;
     assert_eq!(checked.send(&server.client).await.unwrap().revision, None);
     assert!(!server.folder.path().join("rooms/there").exists());
 
     for created in [true, false] {
-        let answer = upload("rooms/there").send(&server.client).await.unwrap();
+        let answer = upload("there").send(&server.client).await.unwrap();
         assert_eq!(answer.revision.unwrap().revision, 1);
         assert_eq!((answer.created, answer.served), (created, true));
     }
@@ -118,7 +118,7 @@ async fn uploaded_keypoints_are_stored_as_those_from_the_disk() {
     assert!(store.verify(&|_| ()).await.unwrap().is_empty());
 
     // The same frames without keypoints keep those that are there.
-    let mut without = upload("rooms/there");
+    let mut without = upload("there");
     without.spec.keypoints = None;
     without.keypoints.clear();
     let answer = without.send(&server.client).await.unwrap();
@@ -131,15 +131,15 @@ async fn uploaded_keypoints_are_stored_as_those_from_the_disk() {
 #[tokio::test]
 async fn frames_that_extend_a_room_have_the_keypoints_that_are_sent() {
     let (server, store) = start_writable().await;
-    upload("rooms/a").send(&server.client).await.unwrap();
+    upload("a").send(&server.client).await.unwrap();
     let known = stored(&store, "a").await.map.frames.clone();
 
     let room = room_of("any", "synthetic_b");
-    let mut without = Upload::of("rooms/a", &room, &features_of("synthetic_b"));
+    let mut without = Upload::of("a", &room, &features_of("synthetic_b"));
     without.batches.truncate(1);
-    without.spec.extend = true;
+    without.spec.mode = pb::UploadMode::Extend.into();
     let mut with = without.clone();
-    let whole = upload("rooms/a");
+    let whole = upload("a");
     with.spec.camera = whole.spec.camera;
     with.spec.keypoints = whole.spec.keypoints;
     let sent = keypoints(100);
@@ -179,7 +179,7 @@ fn stated(upload: &mut Upload) -> &mut pb::KeypointsUpload {
 #[tokio::test]
 async fn unfit_keypoints_are_refused_and_leave_nothing() {
     let (server, store) = start_writable().await;
-    let good = upload("rooms/bad");
+    let good = upload("bad");
     let cases: [Unfit<Upload>; 21] = [
         (|u| u.spec.camera = None, "room.camera"),
         (
@@ -255,18 +255,18 @@ async fn unfit_keypoints_are_refused_and_leave_nothing() {
 #[tokio::test]
 async fn keypoints_count_toward_the_memory_of_uploads() {
     let (folder, store) = filled_store().await;
-    let file: usize = upload("rooms/a").keypoints.iter().map(Vec::len).sum();
+    let file: usize = upload("a").keypoints.iter().map(Vec::len).sum();
     let config = Config {
         upload_bytes: 4 * file,
         ..writable()
     };
     let server = start_on(folder, store, config).await;
 
-    let answer = upload("rooms/a").send(&server.client).await;
+    let answer = upload("a").send(&server.client).await;
     assert_eq!(answer.unwrap_err().code(), Some(Code::ResourceExhausted));
-    assert!(!server.folder.path().join("rooms/a").exists());
+    assert!(!server.folder.path().join("a").exists());
 
-    let mut without = upload("rooms/a");
+    let mut without = upload("a");
     without.spec.keypoints = None;
     without.keypoints.clear();
     assert!(without.send(&server.client).await.unwrap().served);

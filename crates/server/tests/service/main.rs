@@ -25,6 +25,7 @@ mod navigators;
 mod operations;
 mod refusals;
 mod reload;
+mod revisions;
 mod room_memory;
 mod security;
 mod sensors;

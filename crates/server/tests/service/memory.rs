@@ -186,7 +186,7 @@ async fn an_idle_stream_holds_nothing_of_its_messages() {
         ..pb::TrackConfig::default()
     };
     let large = pb::TrackFrame {
-        sequence: 1,
+        sequence_number: 1,
         timestamp_ns: 1,
         view: feature(vec![0.0; 250_000]),
         ..pb::TrackFrame::default()

@@ -140,7 +140,7 @@ async fn an_adapters_table_has_its_correctors() {
 
         near(
             ours,
-            row.mse.unwrap(),
+            row.latent_mse.unwrap(),
             number(&expected[theirs]["mse"]),
             1e-9,
         );
@@ -149,7 +149,7 @@ async fn an_adapters_table_has_its_correctors() {
         for hit in &row.hit_rates {
             near(
                 ours,
-                hit.rate.unwrap().rate,
+                hit.proportion.unwrap().value,
                 number(&hits[hit.threshold.to_string()]),
                 1e-12,
             );
@@ -199,7 +199,7 @@ async fn a_mixture_answers_and_takes_its_own_latents() {
         view: latent(values.clone()),
         ..pb::LocalizeRequest::default()
     };
-    let places = server.client.localize(place).await.unwrap().places;
+    let places = server.client.localize(place).await.unwrap().frames;
 
     assert_eq!(
         places[0].frame.as_ref().unwrap().frame_id,
@@ -224,17 +224,17 @@ async fn a_mixture_answers_and_takes_its_own_latents() {
 #[tokio::test]
 async fn navigators_that_cannot_answer_are_refused() {
     let server = start_with(&oracle_adapter()).await;
-    for (navigator, reading, field) in [
+    for (navigator, inverse_variant, field) in [
         ("corrector-mlp-2", 0, "navigator"),
         ("inverse-poincare-affine+calibrated", 0, "navigator"),
         ("no-such", 0, "navigator"),
         ("identity", 0, "navigator"),
         ("ridge-refit+no-such", 0, "navigator"),
-        ("ridge-refit", 2, "reading"),
+        ("ridge-refit", 2, "inverse_variant"),
     ] {
         let request = pb::NavigateRequest {
             navigator: navigator.to_owned(),
-            reading,
+            inverse_variant,
             ..question()
         };
         let refused = server.client.navigate(request).await.unwrap_err();

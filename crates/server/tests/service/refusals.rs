@@ -68,7 +68,7 @@ async fn navigate_names_the_field() {
         request.displacement = by_twist([0.0; 6]);
     }
 
-    let invalid: [Case<pb::NavigateRequest>; 29] = [
+    let invalid: [Case<pb::NavigateRequest>; 27] = [
         ("no room", |r| r.room.clear(), "room"),
         ("no source", |r| r.source = None, "source"),
         (
@@ -167,10 +167,12 @@ async fn navigate_names_the_field() {
             |r| (r.steps, r.top_k) = (Some(1_000), Some(1_000)),
             "top_k",
         ),
-        ("ε of 0", |r| r.thresholds = vec![0.1, 0.0], "thresholds"),
-        ("ε NaN", |r| r.thresholds = vec![f64::NAN], "thresholds"),
-        ("unknown mode", |r| r.mode = 77, "mode"),
-        ("unknown reading", |r| r.reading = -1, "reading"),
+        ("unknown mode", |r| r.step_mode = 77, "step_mode"),
+        (
+            "unknown variant",
+            |r| r.inverse_variant = -1,
+            "inverse_variant",
+        ),
         (
             "a frame with a pose",
             |r| r.source_pose = Some(level()),
@@ -334,7 +336,7 @@ async fn evaluate_names_the_field() {
             |r| r.stride = Some(u32::MAX),
             "stride",
         ),
-        ("unknown split", |r| r.split = "random".into(), "split"),
+        ("unknown split", |r| r.split = 77, "split"),
         (
             "unknown navigator",
             |r| r.navigators = vec!["magic".into()],
@@ -384,19 +386,28 @@ async fn score_predictions_names_the_field() {
     }
     fn latent(width: usize) -> pb::Prediction {
         let values = vec![0.0; width];
-        from_to(500, 540, Some(Scored::Latent(pb::Latent { values })))
+        let latent = pb::Latent {
+            values,
+            adapter: None,
+        };
+        from_to(500, 540, Some(Scored::Latent(latent)))
     }
 
-    let invalid: [Case<pb::ScorePredictionsRequest>; 9] = [
+    let invalid: [Case<pb::ScorePredictionsRequest>; 10] = [
         ("none", |_| (), "predictions"),
         (
             "too many",
-            |r| r.predictions = vec![retrieved(540, 541); 4],
+            |r| r.predictions = (0..4).map(|step| retrieved(540 + step, 541)).collect(),
             "predictions",
         ),
         (
+            "a pair twice",
+            |r| r.predictions = vec![retrieved(540, 541); 2],
+            "predictions[1]",
+        ),
+        (
             "an empty one",
-            |r| r.predictions = vec![retrieved(540, 541), from_to(500, 540, None)],
+            |r| r.predictions = vec![retrieved(540, 541), from_to(500, 541, None)],
             "predictions[1]",
         ),
         (
@@ -416,7 +427,7 @@ async fn score_predictions_names_the_field() {
         ),
         (
             "a mixture",
-            |r| r.predictions = vec![latent(20), retrieved(540, 541)],
+            |r| r.predictions = vec![latent(20), retrieved(541, 541)],
             "predictions",
         ),
         (
@@ -434,7 +445,8 @@ async fn score_predictions_names_the_field() {
     let server = start_bounded().await;
     let good = pb::ScorePredictionsRequest {
         room: "synthetic".into(),
-        split: "time".into(),
+        adapter: "oracle".into(),
+        split: pb::Split::Time.into(),
         ..Default::default()
     };
     let ask = async |request| server.client.score_predictions(request).await;

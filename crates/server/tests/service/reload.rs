@@ -36,12 +36,8 @@ async fn start_watched() -> (TestServer, Store, Arc<Notify>) {
 
 async fn revision_of(client: &Client, room: &str) -> Option<u64> {
     let rooms = client.rooms().await.unwrap();
-    let revisions = rooms.into_iter().filter_map(|room| room.revision);
-
-    revisions
-        .filter(|revision| revision.name == room)
-        .map(|revision| revision.revision)
-        .next()
+    let served = rooms.into_iter().find(|served| served.name == room);
+    served.map(|served| served.revision)
 }
 
 async fn publish_reversed(store: &Store) {

@@ -106,9 +106,11 @@ async fn asked_in(client: &Client, room: &str) -> [Code; 6] {
         displacement: to_frame(5),
         ..pb::NavigateRequest::default()
     };
-    let nothing_chosen = client.set_default(pb::SetDefaultRequest {
-        name: format!("rooms/{room}"),
-        ..pb::SetDefaultRequest::default()
+    let nothing_chosen = client.clear_default(pb::ClearDefaultRequest {
+        default: Some(pb::clear_default_request::Default::RoomRevision(
+            room.to_owned(),
+        )),
+        ..pb::ClearDefaultRequest::default()
     });
 
     [
@@ -249,7 +251,7 @@ async fn a_room_out_of_reach_does_not_exist() {
         .await
         .unwrap()
         .into_iter()
-        .map(|room| room.revision.unwrap().name)
+        .map(|room| room.name)
         .collect();
     assert_eq!(names, ["synthetic"]);
 

@@ -101,7 +101,7 @@ async fn gravity_that_contradicts_the_views_is_said() {
         assert_eq!(last.reason.contains("gravity"), contradicts);
 
         // What is surely seen is believed.
-        let off = PoseError::between(&pose(last.map_from_camera.as_ref()), &room.poses()[59]);
+        let off = PoseError::between(&pose(last.map_from_camera()), &room.poses()[59]);
         assert!(off.rotation_rad < 0.05, "{name}: {off:?}");
     }
 }
@@ -142,16 +142,16 @@ async fn a_second_camera_finds_a_robot_whose_own_is_covered() {
     let found = updates(&server, rig.clone(), (0..80).map(covered)).await;
     let last = &found[79];
     assert_eq!(last.status(), pb::TrackStatus::Tracking, "{}", last.reason);
-    assert_eq!(last.best_camera, "second");
+    assert_eq!(last.r#match.as_ref().unwrap().camera, "second");
     let truth = room.poses()[79] * mounting.inverse();
-    let off = PoseError::between(&pose(last.map_from_camera.as_ref()), &truth);
+    let off = PoseError::between(&pose(last.map_from_camera()), &truth);
     assert!(off.translation_m < 0.1, "{off:?}");
 
     // Alone, its own camera finds nothing.
     let alone = (0..80).map(|row| changed(row, |frame| frame.view = row_of("attic", 0)));
     let alone = updates(&server, rig, alone).await;
     assert_ne!(alone[79].status(), pb::TrackStatus::Tracking);
-    assert_eq!(alone[79].best_camera, "");
+    assert_eq!(alone[79].r#match.as_ref().unwrap().camera, "");
 }
 
 /// Oracle: the stream that is never covered. A hand before the lens of a robot whose other camera
@@ -184,10 +184,10 @@ async fn a_hand_before_one_of_two_lenses_loses_nothing() {
             "{row}: {}",
             update.reason
         );
-        let off = PoseError::between(&pose(update.map_from_camera.as_ref()), &room.poses()[row]);
+        let off = PoseError::between(&pose(update.map_from_camera()), &room.poses()[row]);
         assert!(off.translation_m < 0.1, "{row}: {off:?}");
     }
-    assert_eq!(found[80].best_camera, "second");
+    assert_eq!(found[80].r#match.as_ref().unwrap().camera, "second");
 }
 
 /// Oracle: a frozen second camera tells nothing: it leads no more, and the stream's own camera is
@@ -221,12 +221,12 @@ async fn a_frozen_second_camera_is_not_believed() {
     });
 
     let found = updates(&server, rig, frozen).await;
-    let leads = |update: &&pb::TrackUpdate| update.best_camera == "second";
+    let leads = |update: &&pb::TrackUpdate| update.r#match.as_ref().unwrap().camera == "second";
     assert!(leads(&&found[0]));
     assert!(!found[1..].iter().any(|update| leads(&update)));
     let last = &found[79];
     assert_eq!(last.status(), pb::TrackStatus::Tracking, "{}", last.reason);
-    let off = PoseError::between(&pose(last.map_from_camera.as_ref()), &room.poses()[79]);
+    let off = PoseError::between(&pose(last.map_from_camera()), &room.poses()[79]);
     assert!(off.translation_m < 0.1, "{off:?}");
 }
 
@@ -449,7 +449,7 @@ async fn a_gyroscope_turns_the_pose_where_nothing_is_seen() {
             })
         });
         let found = updates(&server, with_sensor.clone(), frames).await;
-        let last = pose(found[59].map_from_camera.as_ref());
+        let last = pose(found[59].map_from_camera());
         errors.push(PoseError::between(&last, &room.poses()[59]).rotation_rad);
     }
     assert!(

@@ -81,7 +81,7 @@ fn seen_of(room: &str, row: usize) -> pb::TrackRequest {
     let view = feature(served(room).1.rows().row(row).to_vec());
     message(pb::TrackFrame {
         timestamp_ns: row as i64 * 33_000_000,
-        sequence: row as u64 + 1,
+        sequence_number: row as u64 + 1,
         view,
         ..pb::TrackFrame::default()
     })
@@ -108,7 +108,7 @@ pub async fn answers(
     while let Some(mut answer) = stream.message().await? {
         if let Some(Answer::Update(update)) = &mut answer.answer {
             // The one thing that two runs may differ in.
-            update.elapsed_ns = 0;
+            update.timing = None;
         }
 
         answers.push(answer);
@@ -151,13 +151,20 @@ async fn a_camera_in_a_mapped_room_is_followed() {
 
     for (row, answer) in answers[1..].iter().enumerate() {
         let update = update(answer);
-        assert_eq!(update.sequence, row as u64 + 1);
+        assert_eq!(update.sequence_number, row as u64 + 1);
         assert_eq!(update.timestamp_ns, row as i64 * 33_000_000);
 
-        for numbers in [
-            &update.odom_from_camera_covariance,
-            &update.motion_covariance,
-        ] {
+        let camera = update.camera.as_ref().unwrap();
+        let keyframe = update.keyframe.as_ref().unwrap();
+        let velocity = camera.velocity.as_ref();
+        let covariances = [
+            &camera.odom_pose.as_ref().unwrap().covariance,
+            &keyframe.motion.as_ref().unwrap().covariance,
+        ];
+        for numbers in covariances
+            .into_iter()
+            .chain(velocity.map(|velocity| &velocity.covariance))
+        {
             let covariance = matrix(numbers);
             assert!(
                 (covariance - covariance.transpose()).amax() < 1e-12,
@@ -168,31 +175,31 @@ async fn a_camera_in_a_mapped_room_is_followed() {
     }
 
     let searching = update(&answers[1]);
-    let candidate = searching.candidate.as_ref().unwrap();
-    assert_eq!((candidate.sequence, candidate.agreed), (1, 1));
+    let candidate = searching.hypothesis.as_ref().unwrap();
+    assert_eq!((candidate.sequence_number, candidate.agreed), (1, 1));
     assert_eq!(candidate.needed, 10);
 
     // It is reported, not believed.
-    assert!(searching.map_from_camera.is_none());
+    assert!(searching.map_from_camera().is_none());
 
     let last = update(&answers[120]);
-    assert!(last.candidate.is_none());
+    assert!(last.hypothesis.is_none());
     assert_eq!(last.status(), pb::TrackStatus::Tracking, "{}", last.reason);
 
-    let of = |pose: &Option<pb::Pose>| convert::pose(pose.as_ref().unwrap()).unwrap();
+    let of = |pose: Option<&pb::Pose>| convert::pose(pose.unwrap()).unwrap();
 
-    let error = PoseError::between(&of(&last.map_from_camera), &poses[119]);
+    let error = PoseError::between(&of(last.map_from_camera()), &poses[119]);
     assert!(error.translation_m < 0.2, "{error:?}");
     assert!(error.rotation_rad < 0.2, "{error:?}");
 
-    let through = of(&last.map_from_odom) * of(&last.odom_from_camera);
-    assert!(PoseError::between(&through, &of(&last.map_from_camera)).translation_m < 1e-9);
+    let through = of(last.map_from_odom.as_ref()) * of(last.odom_from_camera());
+    assert!(PoseError::between(&through, &of(last.map_from_camera())).translation_m < 1e-9);
     assert_eq!(last.map_from_odom.as_ref().unwrap().parent_frame, "map");
-    assert_eq!(last.odom_from_camera.as_ref().unwrap().parent_frame, "odom");
+    assert_eq!(last.odom_from_camera().unwrap().parent_frame, "odom");
 
     let first = update(&answers[1]);
-    let begins_at = of(&first.odom_from_camera).translation.vector;
-    assert!(begins_at.norm() < 1e-12 && first.body_velocity.is_none());
+    let begins_at = of(first.odom_from_camera()).translation.vector;
+    assert!(begins_at.norm() < 1e-12 && first.camera.as_ref().unwrap().velocity.is_none());
 }
 
 /// Oracle: the contract. A token holds the map pose to the bit: two servers with the same content
@@ -215,7 +222,7 @@ async fn a_stream_goes_on_at_another_server() {
         assert!(here == there, "from {cut}");
         is_nearly(&here[1..], &whole[cut + 1..]);
         if let Some(next) = here.get(1) {
-            let odom = pose_of(update(next).odom_from_camera.as_ref());
+            let odom = pose_of(update(next).odom_from_camera());
             assert!(odom.translation.vector.norm() < 0.05, "{cut}");
         }
     }
@@ -230,8 +237,8 @@ pub fn is_nearly(found: &[pb::TrackResponse], expected: &[pb::TrackResponse]) {
     assert_eq!(found.len(), expected.len());
     for (found, expected) in found.iter().zip(expected) {
         let [found, expected] = [found, expected].map(update);
-        assert_eq!(found.sequence, expected.sequence);
-        let both = (&found.map_from_camera, &expected.map_from_camera);
+        assert_eq!(found.sequence_number, expected.sequence_number);
+        let both = (found.map_from_camera(), expected.map_from_camera());
         if let (Some(found), Some(expected)) = both {
             let [found, expected] = [found, expected].map(|pose| pose_of(Some(pose)));
             let error = PoseError::between(&found, &expected);
@@ -343,10 +350,10 @@ async fn late_and_duplicate_frames_are_refused_and_leave_no_trace() {
     let server = server(KEY).await;
     let plain = answers(&server, followed(config(), 0..20)).await.unwrap();
 
-    let bad = |timestamp_ns, sequence, view| {
+    let bad = |timestamp_ns, sequence_number, view| {
         message(pb::TrackFrame {
             timestamp_ns,
-            sequence,
+            sequence_number,
             view,
             ..pb::TrackFrame::default()
         })
@@ -406,7 +413,7 @@ async fn a_camera_in_another_place_is_not_tracked() {
         let view = feature(numbers.map(|(column, x)| x + strange(column)).collect());
         message(pb::TrackFrame {
             timestamp_ns: row as i64 * 33_000_000,
-            sequence: row as u64 + 1,
+            sequence_number: row as u64 + 1,
             view,
             ..pb::TrackFrame::default()
         })
@@ -428,9 +435,13 @@ async fn a_camera_in_another_place_is_not_tracked() {
         let update = update(answer);
         let reason = &update.reason;
         assert_eq!(update.status(), pb::TrackStatus::Degraded, "{reason}");
-        assert!(update.out_of_distribution > 1.0, "{reason}");
+        let novelty = update.r#match.as_ref().unwrap().novelty;
+        assert!(novelty.unwrap() > 1.0, "{reason}");
     }
-    let volume = |row: usize| matrix(&update(&found[row]).map_from_camera_covariance).determinant();
+    let volume = |row: usize| {
+        let camera = update(&found[row]).camera.as_ref().unwrap();
+        matrix(&camera.map_pose.as_ref().unwrap().covariance).determinant()
+    };
     assert!(volume(40) > volume(20));
 }
 
@@ -595,10 +606,10 @@ async fn a_camera_is_put_where_it_is_not_where_its_keyframe_was() {
 
     let requests = [followed(config, 0..9), vec![put(8), seen(9)]].concat();
     let found = answers(&server, requests).await.unwrap();
-    let keyframe = update(&found[9]).keyframe_sequence;
+    let keyframe = update(&found[9]).keyframe.as_ref().unwrap().sequence_number;
     assert_eq!(keyframe, 1, "the keyframe is old");
 
-    let named = update(&found[11]).map_from_camera.clone().unwrap();
+    let named = update(&found[11]).map_from_camera().cloned().unwrap();
     let plain = pb::Pose {
         parent_frame: String::new(),
         child_frame: String::new(),
@@ -629,7 +640,7 @@ async fn a_room_that_is_not_named_is_found() {
         assert_eq!(last.status(), pb::TrackStatus::Tracking, "{room}: {reason}");
         assert_eq!(last.room.as_ref().unwrap().name, room);
 
-        let map_from_camera = convert::pose(last.map_from_camera.as_ref().unwrap()).unwrap();
+        let map_from_camera = convert::pose(last.map_from_camera().unwrap()).unwrap();
         let error = PoseError::between(&map_from_camera, &served(room).0.poses()[39]);
         assert!(error.translation_m < 0.2, "{room}: {error:?}");
 
@@ -674,11 +685,11 @@ async fn a_camera_can_be_put_and_forgotten() {
         "{}",
         after.reason
     );
-    assert!(after.map_from_camera.is_some());
+    assert!(after.map_from_camera().is_some());
 
     let fresh = update(&found[9]);
-    assert_eq!(fresh.keyframe_sequence, 1);
-    assert!(fresh.body_velocity.is_none());
+    assert_eq!(fresh.keyframe.as_ref().unwrap().sequence_number, 1);
+    assert!(fresh.camera.as_ref().unwrap().velocity.is_none());
     assert_eq!(found[9], found[1], "as if nothing had been");
 }
 
@@ -758,7 +769,7 @@ async fn a_robot_gets_the_poses_of_its_base() {
     let plain = answers(&server, followed(config(), 0..40)).await.unwrap();
     let based = answers(&server, followed(on_base, 0..40)).await.unwrap();
 
-    let pose = |given: &Option<pb::Pose>| convert::pose(given.as_ref().unwrap()).unwrap();
+    let pose = |given: Option<&pb::Pose>| convert::pose(given.unwrap()).unwrap();
     let near = |a: Pose, b: Pose| {
         let apart = PoseError::between(&a, &b);
         assert!(apart.translation_m < 1e-9, "{apart:?}");
@@ -766,31 +777,47 @@ async fn a_robot_gets_the_poses_of_its_base() {
     };
 
     let first = update(&based[1]);
-    near(pose(&first.odom_from_base), Pose::identity());
-    assert!(update(&plain[1]).odom_from_base.is_none());
+    near(pose(first.odom_from_base()), Pose::identity());
+    assert!(update(&plain[1]).base.is_none());
 
     let (plain, based) = (update(&plain[40]), update(&based[40]));
-    assert_eq!(plain.motion, based.motion);
-    assert_eq!(plain.map_from_camera, based.map_from_camera);
-    assert_eq!(
-        plain.map_from_camera_covariance,
-        based.map_from_camera_covariance
-    );
+    assert_eq!(plain.keyframe, based.keyframe);
+    let map_pose = |of: &pb::TrackUpdate| of.camera.clone().unwrap().map_pose;
+    assert_eq!(map_pose(plain), map_pose(based));
 
-    let map_from_base = pose(&based.map_from_base);
-    let odom_from_base = pose(&based.odom_from_base);
-    near(map_from_base * mounting, pose(&based.map_from_camera));
-    near(pose(&based.map_from_odom) * odom_from_base, map_from_base);
-    let moved = mounting * pose(&plain.odom_from_camera);
-    near(pose(&based.odom_from_camera), moved);
-    let child_frame = &based.map_from_base.as_ref().unwrap().child_frame;
+    let map_from_base = pose(based.map_from_base());
+    let odom_from_base = pose(based.odom_from_base());
+    near(map_from_base * mounting, pose(based.map_from_camera()));
+    near(
+        pose(based.map_from_odom.as_ref()) * odom_from_base,
+        map_from_base,
+    );
+    let moved = mounting * pose(plain.odom_from_camera());
+    near(pose(based.odom_from_camera()), moved);
+    let child_frame = &based.map_from_base().unwrap().child_frame;
     assert_eq!(child_frame, "base_link");
-    assert_eq!(based.map_from_base_covariance.len(), 36);
+
+    // The base's covariances: a rotation about the camera moves the base by the mounting's arm.
+    let [camera, base] = [&based.camera, &based.base].map(|body| body.as_ref().unwrap());
+    let [camera_pose, base_pose] =
+        [camera, base].map(|body| body.map_pose.as_ref().unwrap().covariance.clone());
+    let arm = map_from_base.translation.vector
+        - convert::pose(based.map_from_camera().unwrap())
+            .unwrap()
+            .translation
+            .vector;
+    let mut moved_by = nalgebra::Matrix6::identity();
+    moved_by
+        .fixed_view_mut::<3, 3>(0, 3)
+        .copy_from(&-arm.cross_matrix());
+    let expected = moved_by * matrix(&camera_pose) * moved_by.transpose();
+    assert!((matrix(&base_pose) - expected).amax() < 1e-9);
 
     // A point that is fixed to the base moves with the base's velocity and with the camera's.
-    let moved = |velocity: &Option<pb::Twist>| convert::twist(velocity.as_ref().unwrap()).unwrap();
-    let of_camera = moved(&based.body_velocity);
-    let of_base = moved(&based.base_velocity);
+    let velocity_of = |body: &pb::TrackedBody| body.velocity.clone().unwrap();
+    let moved = |body| convert::twist(&velocity_of(body).twist.unwrap()).unwrap();
+    let of_camera = moved(camera);
+    let of_base = moved(base);
     let turn = mounting.rotation * of_camera.angular;
     assert!((turn - of_base.angular).norm() < 1e-9);
     let at_camera = of_base.linear + of_base.angular.cross(&mounting.translation.vector);

@@ -1,30 +1,24 @@
-//! NavigationService.NavigateTo: plans a route of stored frames to a goal and streams feedback for
-//! each step.
+//! NavigationService.PlanRoute: plans a route of stored frames to a goal.
 //!
 //! The default planner finds the shortest path in the pose graph. The paper's latent planner is
 //! optional.
 
-use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Instant;
 
-use tokio::sync::mpsc;
-use tokio_stream::{Stream, wrappers::ReceiverStream};
-use tonic::Status;
-use tracing::Instrument;
+use tonic::{Request, Response, Status};
 
 use super::convert;
 use super::cost::{frame_bytes, lane};
 use super::image_view::{ImageView, Searched, ViewFields};
 use super::localization::localizer;
-use super::memory::MemoryLease;
+use super::memory::hold_for_answer;
 use super::snapshot::{ServedNavigator, Snapshot};
 use super::status::view_error;
-use super::workers::{CallContext, Lane};
+use super::workers::{Lane, image_count};
 use super::{Error, Handlers};
 use seese3_client::proto::v1 as pb;
-use seese3_client::proto::v1::navigate_to_request::Goal;
-use seese3_client::proto::v1::navigate_to_response::Event;
+use seese3_client::proto::v1::plan_route_request::Goal;
 use seese3_core::adapter::Reading;
 use seese3_core::cancel::Cancellation;
 use seese3_core::geometry::{Pose, PoseError};
@@ -39,12 +33,11 @@ use seese3_robot::planning::{
 };
 use seese3_robot::tracking::{MapQuery, PoseWithCovariance};
 
-/// Stream of feedback events and the final result.
-pub type Events = Pin<Box<dyn Stream<Item = Result<pb::NavigateToResponse, Status>> + Send>>;
-
 /// In rooms with more frames than this, planning runs in the lane of long requests. It
 /// takes some 10 ms at this size.
 const MOST_SHORT_FRAMES: usize = 5_000;
+/// Upper bound of the encoded size of a hop without its frame, bytes.
+const HOP_BYTES: usize = 100;
 
 /// A validated request, with everything that planning needs.
 struct CheckedRequest {
@@ -63,139 +56,49 @@ struct CheckedRequest {
 enum Ended {
     /// By the latent planner.
     Walked(Outcome),
-    /// By the pose-graph planner. At most `max_steps` hops were sent.
+    /// By the pose-graph planner. A route may have more than `max_hops` hops.
     Planned(Planned),
 }
 
-/// Memory of the events that the caller has not read: all of them until the response ends.
-struct EventMemory {
-    lease: Option<MemoryLease>,
-    event_bytes: usize,
-    event_count: usize,
-}
-
-impl EventMemory {
-    /// Reserves memory for a route of the maximum length.
-    ///
-    /// # Errors
-    /// [`Error::Full`] if there is no memory for it.
-    fn hold(event_count: usize, event_bytes: usize) -> Result<Self, Error> {
-        let lease = MemoryLease::current();
-        if let Some(lease) = &lease {
-            lease.hold(event_count * event_bytes)?;
-        }
-        Ok(Self {
-            lease,
-            event_bytes,
-            event_count,
-        })
-    }
-
-    /// Keeps the memory of `event_count` events.
-    fn keep(&mut self, event_count: usize) {
-        let unused = self.event_count.saturating_sub(event_count);
-        if let Some(lease) = &self.lease {
-            lease.release(unused * self.event_bytes);
-        }
-        self.event_count -= unused;
-    }
-}
-
 impl Handlers {
-    /// Validates a request on a worker thread and starts planning.
-    pub(super) async fn begin_pursuit(
+    /// Answers a PlanRoute request on a worker thread.
+    pub(super) async fn planned_route(
         &self,
-        request: tonic::Request<pb::NavigateToRequest>,
-    ) -> Result<Events, Error> {
-        let snapshot = self.snapshot(&request)?;
-        let most = self.config.limits.steps;
-        let context = self.workers.context(&request);
-        let request = request.into_inner();
-        let lane = Lane::of(&request.source);
-
-        let begun = Instant::now();
-
-        // Validation may encode an image: it runs on a worker thread and uses part of the budget.
-        let ready = self
-            .workers
-            .run(lane, context.clone(), move |_| {
-                ready(&snapshot, request, most)
-            })
-            .await?;
-
-        // All events stay in memory until the caller has read them.
-        let event_count = ready.pursuit.steps as usize + 2;
-        let room = ready.served.navigator.room();
-        let event_bytes = size_of::<pb::NavigateToResponse>() + frame_bytes(room);
-        let memory = EventMemory::hold(event_count, event_bytes)?;
-
-        // The channel holds all events: feedback before the first step and after each step, and the
-        // result. No event is lost, and no worker thread waits for a slow reader.
-        let (events, stream) = mpsc::channel(event_count);
-        let left = context.after(begun.elapsed());
-        tokio::spawn(
-            self.clone()
-                .pursue(ready, left, events, memory)
-                .instrument(tracing::Span::current()),
-        );
-
-        Ok(Box::pin(ReceiverStream::new(stream)))
-    }
-
-    /// Sends feedback, then the result or the error. Stops if the caller closes the stream.
-    async fn pursue(
-        self,
-        ready: CheckedRequest,
-        context: CallContext,
-        events: mpsc::Sender<Result<pb::NavigateToResponse, Status>>,
-        mut memory: EventMemory,
-    ) {
-        let caller = events.clone();
-        let begun = Instant::now();
-        let frame_count = ready.served.navigator.room().frame_count();
-        let lane = match ready.planner {
-            // Each step compares all frames.
-            pb::Planner::Latent => lane(0, f64::from(ready.pursuit.steps) * frame_count as f64),
-            // Planning time grows with the square of the number of frames.
-            _ if frame_count > MOST_SHORT_FRAMES => Lane::Long,
-            _ => Lane::Short,
-        };
-
-        let work = move |cancel: &Cancellation| {
-            let start = start_to_wire(&ready.start, &ready.served);
-            let mut sent = 0;
-            let mut each = |feedback: Feedback| {
-                sent += 1;
-                let mut feedback = feedback_to_wire(&feedback, &ready.served, begun);
-                if feedback.current_step == 0 {
-                    feedback.start = Some(start.clone());
+        request: Request<pb::PlanRouteRequest>,
+    ) -> Result<Response<pb::Route>, Status> {
+        let most_hops = self.config.limits.steps;
+        self.unary(
+            request,
+            move |costs, request| {
+                let room = costs.snapshot.rooms().get(&request.room);
+                let frame_count = room.map_or(0, |room| room.summary.frame_count);
+                let images = image_count(&request.source);
+                match request.planner() {
+                    // Each step compares all frames.
+                    pb::Planner::Latent => {
+                        let steps = request.max_hops.unwrap_or(100).min(most_hops);
+                        lane(images, f64::from(steps) * frame_count as f64)
+                    }
+                    // Planning time grows with the square of the number of frames.
+                    _ if frame_count > MOST_SHORT_FRAMES => Lane::Long,
+                    _ => lane(images, 0.0),
                 }
+            },
+            move |snapshot, request, cancel| {
+                let begun = Instant::now();
+                let request = checked(snapshot, request, most_hops)?;
+                let room = request.served.navigator.room();
+                let hop_bytes = HOP_BYTES + frame_bytes(room);
+                hold_for_answer(request.pursuit.steps as usize * hop_bytes)?;
 
-                // `try_send` fails if the caller closed the stream; the `select!` below then
-                // cancels the work.
-                let _ = events.try_send(Ok(pb::NavigateToResponse {
-                    event: Some(Event::Feedback(feedback)),
-                }));
-            };
-
-            let ended = ready.plan(cancel, &mut each)?;
-            memory.keep(sent + 1);
-            Ok(result_to_wire(&ended, &ready))
-        };
-
-        // If the caller closes the stream, `run` is dropped, which cancels planning.
-        let finished = tokio::select! {
-            finished = self.workers.run(lane, context, work) => finished,
-            () = caller.closed() => return,
-        };
-        let last = finished
-            .map(|result| pb::NavigateToResponse {
-                event: Some(Event::Result(result)),
-            })
-            .map_err(Status::from);
-
-        // `send` fails if the caller closed the stream.
-        let _ = caller.send(last).await;
+                let (ended, feedback) = request.plan(cancel)?;
+                let mut route = route_to_wire(&ended, &feedback, &request);
+                route.planning_time_ns =
+                    u64::try_from(begun.elapsed().as_nanos()).unwrap_or(u64::MAX);
+                Ok(route)
+            },
+        )
+        .await
     }
 }
 
@@ -209,10 +112,11 @@ impl CheckedRequest {
         })
     }
 
-    /// Plans the route; calls `each` with the feedback before the first step and after each step.
-    fn plan(&self, cancel: &Cancellation, each: &mut dyn FnMut(Feedback)) -> Result<Ended, Error> {
+    /// Plans the route. Also returns the feedback before the first hop and after each hop.
+    fn plan(&self, cancel: &Cancellation) -> Result<(Ended, Vec<Feedback>), Error> {
         if self.planner == pb::Planner::Latent {
             let stepper = Stepper::InversePoincare(Reading::Homogeneous);
+            let mut feedback = Vec::new();
             let outcome = pursue(
                 &self.served.navigator,
                 &stepper,
@@ -220,10 +124,10 @@ impl CheckedRequest {
                 &self.goal,
                 self.pursuit,
                 cancel,
-                each,
+                &mut |step| feedback.push(step),
             )?;
 
-            return Ok(Ended::Walked(outcome));
+            return Ok((Ended::Walked(outcome), feedback));
         }
 
         let navigator = &self.served.navigator;
@@ -235,62 +139,118 @@ impl CheckedRequest {
         };
         let planned = plan(navigator, &self.start, &self.goal, bounds, cancel).map_err(E::from)?;
 
-        // Without a route, still send the feedback of the start.
+        // Without a route, there is still the feedback of the start.
         let nowhere = Route::default();
         let route = match &planned {
             Planned::Way { route, .. } => route,
             Planned::StartUnknown(_) | Planned::NoRoute(_) => &nowhere,
         };
         let latent = self.view.latent.view();
-        route
-            .feedback(navigator, latent, &self.start.pose, &self.goal)
-            .into_iter()
-            .take(self.pursuit.steps as usize + 1)
-            .for_each(each);
-
-        Ok(Ended::Planned(planned))
+        let mut feedback = route.feedback(navigator, latent, &self.start.pose, &self.goal);
+        feedback.truncate(self.pursuit.steps as usize + 1);
+        Ok((Ended::Planned(planned), feedback))
     }
 }
 
-fn ready(
+fn checked(
     snapshot: &Snapshot,
-    request: pb::NavigateToRequest,
-    most_steps: u32,
+    request: pb::PlanRouteRequest,
+    most_hops: u32,
 ) -> Result<CheckedRequest, Error> {
     // Destructured without `..`, so that a new field fails to compile here.
-    let pb::NavigateToRequest {
+    let pb::PlanRouteRequest {
         room,
+        room_revision: _,
         adapter,
+        adapter_revision: _,
         source,
         source_pose,
+        source_camera,
         goal,
-        step,
+        max_hop_length,
         tolerance_m,
         tolerance_rad,
-        max_steps,
+        max_hops,
         max_recoveries,
         planner,
-        least_arrival_probability,
-        source_camera,
+        min_arrival_probability,
     } = request;
 
-    let least_arrival_probability = least_probability(least_arrival_probability)?;
+    let least_arrival_probability = least_probability(min_arrival_probability)?;
 
     let planner = pb::Planner::try_from(planner)
         .map_err(|_| Error::invalid("planner", format!("has no value {planner}")))?;
 
-    let served = snapshot.navigator(&room, &adapter)?;
+    let adapter = convert::stated_adapter(&adapter, &source)?;
+    let served = snapshot.navigator(&room, adapter)?;
+    let (view, start) = start_of(
+        snapshot,
+        &served,
+        StatedSource {
+            view: source,
+            pose: source_pose,
+            camera: source_camera,
+        },
+    )?;
     let navigator = &served.navigator;
-    let matched = match &source_pose {
-        None => MatchedSource::of(snapshot, &served, source.as_ref(), source_camera.as_ref())?,
+    let goal = goal_pose(goal, navigator, &room)?;
+    let own_step = Pursuit::of(navigator).step;
+    let hops = max_hop_length.map_or(Hops::Preferably(own_step), Hops::AtMost);
+    let pursuit = bounds(
+        Pursuit::of(navigator),
+        PursuitOverrides {
+            max_hop_length,
+            tolerance_m,
+            tolerance_rad,
+            max_hops,
+            max_recoveries,
+        },
+        most_hops,
+    )?;
+
+    Ok(CheckedRequest {
+        served,
+        view,
+        start,
+        goal,
+        pursuit,
+        hops,
+        least_arrival_probability,
+        planner,
+    })
+}
+
+/// The source of a request.
+struct StatedSource {
+    view: Option<pb::View>,
+    pose: Option<pb::Pose>,
+    camera: Option<pb::ViewCamera>,
+}
+
+/// The source view, and the start of the route.
+fn start_of(
+    snapshot: &Snapshot,
+    served: &ServedNavigator,
+    stated: StatedSource,
+) -> Result<(Start, BelievedStart), Error> {
+    let navigator = &served.navigator;
+    let matched = match &stated.pose {
+        None => MatchedSource::of(
+            snapshot,
+            served,
+            stated.view.as_ref(),
+            stated.camera.as_ref(),
+        )?,
         Some(_) => MatchedSource::default(),
     };
     let source = match matched.feature {
         Some(feature) => Source::Feature(feature),
-        None => convert::source("source", source, &served.adapter, snapshot)?,
+        None => convert::source("source", stated.view, &served.adapter, snapshot)?,
     };
-    let pose = source_pose
-        .map(|pose| convert::pose(pose, &room))
+    let room = navigator.room().id().as_str();
+    let pose = stated
+        .pose
+        .map(|pose| convert::pose(pose, room))
         .transpose();
     let pose = pose.map_err(|error| error.within("source_pose"))?;
 
@@ -309,34 +269,10 @@ fn ready(
             other => Error::from(other),
         })?;
 
-    let start = believed_start(&served, &source, &view, matched.found)?;
+    let start = believed_start(served, &source, &view, matched.found)?;
     view.pose = Some(start.pose);
 
-    let goal = goal_pose(goal, navigator, &room)?;
-    let own_step = Pursuit::of(navigator).step;
-    let hops = step.map_or(Hops::Preferably(own_step), Hops::AtMost);
-    let pursuit = bounds(
-        Pursuit::of(navigator),
-        PursuitOverrides {
-            step,
-            tolerance_m,
-            tolerance_rad,
-            max_steps,
-            max_recoveries,
-        },
-        most_steps,
-    )?;
-
-    Ok(CheckedRequest {
-        served,
-        view,
-        start,
-        goal,
-        pursuit,
-        hops,
-        least_arrival_probability,
-        planner,
-    })
+    Ok((view, start))
 }
 
 /// A source image whose keypoints were matched with those of the room.
@@ -418,7 +354,7 @@ fn least_probability(given: Option<f64>) -> Result<f64, Error> {
     }
 
     let problem = format!("must be 0 to 1, got {least}");
-    Err(Error::invalid("least_arrival_probability", problem))
+    Err(Error::invalid("min_arrival_probability", problem))
 }
 
 /// The goal frame or goal pose as a pose in the room's world frame.
@@ -440,15 +376,15 @@ fn goal_pose(goal: Option<Goal>, navigator: &Navigator, room: &str) -> Result<Po
 
 /// Bounds given in the request; `None` selects the default.
 struct PursuitOverrides {
-    step: Option<f64>,
+    max_hop_length: Option<f64>,
     tolerance_m: Option<f64>,
     tolerance_rad: Option<f64>,
-    max_steps: Option<u32>,
+    max_hops: Option<u32>,
     max_recoveries: Option<u32>,
 }
 
 /// The bounds of planning: the request's overrides, else the defaults in `own`.
-fn bounds(own: Pursuit, asked: PursuitOverrides, most_steps: u32) -> Result<Pursuit, Error> {
+fn bounds(own: Pursuit, asked: PursuitOverrides, most_hops: u32) -> Result<Pursuit, Error> {
     let positive_or = |field: &str, given: Option<f64>, own: f64| match given {
         None => Ok(own),
         Some(given) if given.is_finite() && given > 0.0 => Ok(given),
@@ -459,19 +395,19 @@ fn bounds(own: Pursuit, asked: PursuitOverrides, most_steps: u32) -> Result<Purs
     };
 
     // The default is clamped to the server's limit; a request above the limit is refused.
-    let steps = match asked.max_steps {
-        None => own.steps.min(most_steps),
-        Some(steps) if (1..=most_steps).contains(&steps) => steps,
-        Some(steps) => {
+    let steps = match asked.max_hops {
+        None => own.steps.min(most_hops),
+        Some(hops) if (1..=most_hops).contains(&hops) => hops,
+        Some(hops) => {
             return Err(Error::invalid(
-                "max_steps",
-                format!("must be 1 to {most_steps}, got {steps}"),
+                "max_hops",
+                format!("must be 1 to {most_hops}, got {hops}"),
             ));
         }
     };
 
     Ok(Pursuit {
-        step: positive_or("step", asked.step, own.step)?,
+        step: positive_or("max_hop_length", asked.max_hop_length, own.step)?,
         tolerance_m: positive_or("tolerance_m", asked.tolerance_m, own.tolerance_m)?,
         tolerance_rad: positive_or("tolerance_rad", asked.tolerance_rad, own.tolerance_rad)?,
         steps,
@@ -479,75 +415,96 @@ fn bounds(own: Pursuit, asked: PursuitOverrides, most_steps: u32) -> Result<Purs
     })
 }
 
-fn feedback_to_wire(
-    feedback: &Feedback,
-    served: &ServedNavigator,
-    begun: Instant,
-) -> pb::NavigateToFeedback {
+fn hop_to_wire(feedback: &Feedback, served: &ServedNavigator) -> pb::RouteHop {
     let Feedback {
-        step,
+        step: _,
         frame,
         motion,
         remaining,
         recoveries,
     } = feedback;
 
-    pb::NavigateToFeedback {
-        current_step: *step,
-        current: frame
+    pb::RouteHop {
+        motion: Some(convert::twist_to_wire(motion)),
+        frame: frame
             .as_ref()
             .map(|frame| convert::retrieved_to_wire(frame, served.navigator.room())),
         distance_remaining_m: remaining.translation_m,
         rotation_remaining_rad: remaining.rotation_rad,
-        number_of_recoveries: *recoveries,
-        navigation_time_ns: u64::try_from(begun.elapsed().as_nanos()).unwrap_or(u64::MAX),
-        motion: Some(convert::twist_to_wire(motion)),
-        start: None,
+        recoveries: *recoveries,
     }
 }
 
-fn start_to_wire(start: &BelievedStart, served: &ServedNavigator) -> pb::StartOfWay {
+fn start_to_wire(start: &BelievedStart, goal: &Pose, served: &ServedNavigator) -> pb::RouteStart {
     let room = served.navigator.room().id().as_str();
     let covariance = start.covariance.map(|covariance| {
-        let belief = PoseWithCovariance {
+        let pose = PoseWithCovariance {
             pose: start.pose,
             covariance,
         };
-        convert::matrix_to_wire(&belief.ros_covariance())
+        convert::matrix_to_wire(&pose.ros_covariance())
     });
+    let remaining = PoseError::between(&start.pose, goal);
 
-    pb::StartOfWay {
-        pose: Some(convert::pose_to_wire(&start.pose, room)),
-        pose_covariance: covariance.unwrap_or_default(),
-        out_of_distribution: start.out_of_distribution,
+    pb::RouteStart {
+        pose: Some(pb::PoseWithCovariance {
+            pose: Some(convert::pose_to_wire(&start.pose, room)),
+            covariance: covariance.unwrap_or_default(),
+        }),
+        novelty: start.out_of_distribution,
+        distance_remaining_m: remaining.translation_m,
+        rotation_remaining_rad: remaining.rotation_rad,
     }
 }
 
-fn result_to_wire(ended: &Ended, ready: &CheckedRequest) -> pb::NavigateToResult {
-    let mut result = pb::NavigateToResult {
-        room: Some(convert::room_revision(&ready.served)),
-        adapter: Some(convert::adapter_revision(&ready.served)),
+fn route_to_wire(ended: &Ended, feedback: &[Feedback], request: &CheckedRequest) -> pb::Route {
+    let mut wire = pb::Route {
+        room: Some(convert::room_revision(&request.served)),
+        adapter: Some(convert::adapter_revision(&request.served)),
+        start: Some(start_to_wire(
+            &request.start,
+            &request.goal,
+            &request.served,
+        )),
         ..Default::default()
     };
 
-    let most = ready.pursuit.steps as usize;
-    let (outcome, message) = match ended {
-        Ended::Walked(Outcome::Reached) => reached(),
+    let (outcome, message) = outcome(ended, request, &mut wire);
+
+    // The first feedback is that of the start. A robot must not drive a route that ends elsewhere.
+    if outcome == pb::RouteOutcome::Found {
+        let hops = feedback.iter().skip(1);
+        wire.hops = hops.map(|hop| hop_to_wire(hop, &request.served)).collect();
+    }
+    wire.set_outcome(outcome);
+    wire.message = message;
+    wire
+}
+
+/// The outcome in words. Also sets the hop length and the arrival probability of `wire`.
+fn outcome(
+    ended: &Ended,
+    request: &CheckedRequest,
+    wire: &mut pb::Route,
+) -> (pb::RouteOutcome, String) {
+    let most = request.pursuit.steps as usize;
+    match ended {
+        Ended::Walked(Outcome::Reached) => found(),
         Ended::Walked(Outcome::Spent) => (
-            pb::NavigateToOutcome::StepsSpent,
-            "max_steps was reached before the goal; raise max_steps".to_owned(),
+            pb::RouteOutcome::NoRoute,
+            format!("the goal is more than max_hops, {most}, hops away; raise max_hops"),
         ),
         Ended::Walked(Outcome::Stuck) => (
-            pb::NavigateToOutcome::Stuck,
+            pb::RouteOutcome::NoRoute,
             "no matching frame is nearer to the goal; try PLANNER_POSE_GRAPH".to_owned(),
         ),
         Ended::Planned(Planned::Way { route, .. })
-            if route.frames.len() > most && !ready.ends_within(&route.frames[..most]) =>
+            if route.frames.len() > most && !request.ends_within(&route.frames[..most]) =>
         {
             (
-                pb::NavigateToOutcome::StepsSpent,
+                pb::RouteOutcome::NoRoute,
                 format!(
-                    "the route has {} hops, max_steps is {most}; raise max_steps, or step for longer hops",
+                    "the route has {} hops, max_hops is {most}; raise max_hops, or max_hop_length for longer hops",
                     route.frames.len()
                 ),
             )
@@ -556,33 +513,34 @@ fn result_to_wire(ended: &Ended, ready: &CheckedRequest) -> pb::NavigateToResult
             route,
             arrival_probability,
         }) => {
-            result.arrival_probability = *arrival_probability;
-            let longest =
-                route.longest_hop(&ready.start.pose, ready.served.navigator.room().poses());
-            result.needed_step = Some(longest).filter(|longest| *longest > ready.pursuit.step);
-            reached()
+            wire.arrival_probability = *arrival_probability;
+            let poses = request.served.navigator.room().poses();
+            let longest = route.longest_hop(&request.start.pose, poses);
+            wire.needed_hop_length =
+                Some(longest).filter(|longest| *longest > request.pursuit.step);
+            found()
         }
         Ended::Planned(Planned::StartUnknown(why)) => {
             if let StartUnknown::Unsure {
                 arrival_probability,
             } = why
             {
-                result.arrival_probability = Some(*arrival_probability);
+                wire.arrival_probability = Some(*arrival_probability);
             }
-            (pb::NavigateToOutcome::StartUnknown, start_unknown(why))
+            (pb::RouteOutcome::StartUnknown, start_unknown(why))
         }
         Ended::Planned(Planned::NoRoute(NoRoute::HopTooLong { needed })) => {
-            result.needed_step = Some(*needed);
+            wire.needed_hop_length = Some(*needed);
             (
-                pb::NavigateToOutcome::Stuck,
+                pb::RouteOutcome::NoRoute,
                 format!(
-                    "every route has a hop longer than step, {:.3}; a route exists with step {needed:.3}",
-                    ready.pursuit.step
+                    "every route has a hop longer than max_hop_length, {:.3}; a route exists with {needed:.3}",
+                    request.pursuit.step
                 ),
             )
         }
         Ended::Planned(Planned::NoRoute(NoRoute::GoalNotMapped { nearest, off })) => (
-            pb::NavigateToOutcome::GoalNotMapped,
+            pb::RouteOutcome::GoalNotMapped,
             format!(
                 "no frame is within the tolerances of the goal; frame {nearest} is nearest to the goal, {:.2} m \
                  and {:.1} degrees off",
@@ -590,16 +548,12 @@ fn result_to_wire(ended: &Ended, ready: &CheckedRequest) -> pb::NavigateToResult
                 off.rotation_rad.to_degrees()
             ),
         ),
-    };
-
-    result.set_outcome(outcome);
-    result.message = message;
-    result
+    }
 }
 
-fn reached() -> (pb::NavigateToOutcome, String) {
+fn found() -> (pb::RouteOutcome, String) {
     (
-        pb::NavigateToOutcome::Reached,
+        pb::RouteOutcome::Found,
         "the route ends within the tolerances of the goal".to_owned(),
     )
 }
@@ -612,7 +566,7 @@ fn start_unknown(why: &StartUnknown) -> String {
         StartUnknown::FarFromRoom {
             out_of_distribution: Some(out_of_distribution),
         } => format!(
-            "the source looks like another place: out_of_distribution is {out_of_distribution:.2}, the \
+            "the source looks like another place: its novelty is {out_of_distribution:.2}, the \
              limit is 1; send another view, or source_pose"
         ),
         StartUnknown::Unsure {
