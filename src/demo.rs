@@ -296,8 +296,8 @@ fn warn_if_too_short(record: &TrainingRecord, frames: usize) {
     let r2 = record.test.overall;
     if r2 < 0.0 && frames < DEFAULT_FRAMES {
         say(format_args!(
-            "   {frames} images are too few to learn motions from (R² {r2:.2} on held-out frames, \
-             where 0 is a constant); use --frames {DEFAULT_FRAMES} or more"
+            "   {frames} images are too few to learn motions from (R² {r2:.2} on held-out frames; \
+             their mean motion has 0); use --frames {DEFAULT_FRAMES} or more"
         ));
     }
 }

@@ -111,6 +111,7 @@ struct ExpectedError {
 /// Expected errors at the median disagreement of the held-out views, nearest views first.
 fn expected_errors(fitted: &Fitted) -> Vec<ExpectedError> {
     let expected = fitted.rules.rules().iter().map(|rule| {
+        // `least_disagreement` is a quarter of the median.
         let median_disagreement = 4.0 * rule.least_disagreement;
         let variances = rule
             .covariance_at(rule.up_to, median_disagreement)

@@ -145,7 +145,10 @@ fn say_route(route: &pb::Route) {
     let outcome = value_text(route.outcome().as_str_name(), "ROUTE_OUTCOME_");
     say(format_args!("{outcome}: {}", route.message));
     if let Some(length) = route.needed_hop_length {
-        say(format_args!("the longest hop of the route is {length:.3}"));
+        // Without a route, this is the length with which there is one.
+        say(format_args!(
+            "every route has a hop of {length:.3} or longer"
+        ));
     }
     if let Some(probability) = route.arrival_probability {
         say(format_args!(
