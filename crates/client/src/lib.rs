@@ -24,7 +24,8 @@
 //!     })
 //!     .await?;
 //!
-//! let motion = convert::twist(&answer.motion.unwrap_or_default())?;
+//! let motion = answer.motion.and_then(|motion| motion.twist).ok_or("no motion")?;
+//! let motion = convert::twist(&motion)?;
 //! println!("{:.2} m, {:.1}°", motion.linear.norm(), motion.angular.norm().to_degrees());
 //! # Ok(()) }
 //! ```
