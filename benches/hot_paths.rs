@@ -26,7 +26,7 @@ use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::{Twist, exp};
 use seese3_core::index::{ExactIndex, HnswIndex, HnswParameters, Index};
 use seese3_core::navigation::{
-    Displacement, FitOn, IndexKind, Limits, Mode, Navigator, Query, Reading, RetrievalMetric,
+    FitOn, IndexKind, Limits, Mode, Navigator, Query, Reading, RequestedMotion, RetrievalMetric,
     Source, SourceAt, StepKind,
 };
 use seese3_core::room::{FrameId, Frames, Provenance, Room, RoomId};
@@ -116,7 +116,7 @@ fn query(steps: u32) -> Query {
             source: Source::Frame(FrameId(7)),
             pose: None,
         },
-        displacement: Displacement::Twists(vec![twist]),
+        motion: RequestedMotion::Twists(vec![twist]),
         steps,
         mode: Mode::OpenLoop,
         step: StepKind::InversePoincare(Reading::Homogeneous),
@@ -272,8 +272,8 @@ fn rpc(criterion: &mut Criterion) {
         source: Some(pb::View {
             view: Some(pb::view::View::FrameId(7)),
         }),
-        displacement: Some(pb::Displacement {
-            displacement: Some(pb::displacement::Displacement::TargetFrameId(47)),
+        motion: Some(pb::RequestedMotion {
+            motion: Some(pb::requested_motion::Motion::TargetFrameId(47)),
         }),
         steps: Some(4),
         ..pb::NavigateRequest::default()

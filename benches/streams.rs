@@ -380,7 +380,9 @@ async fn images([streams, hz, seconds]: [f64; 3], [store, room, folder, model]: 
     let address = serve(store, config).await;
     let config = pb::TrackConfig {
         room: room.to_owned(),
-        mapping_camera: true,
+        camera: Some(pb::ViewCamera {
+            camera: Some(pb::view_camera::Camera::MappingCamera(pb::MappingCamera {})),
+        }),
         token_every: Some(1000),
         ..pb::TrackConfig::default()
     };
@@ -450,7 +452,7 @@ async fn features([streams, hz, seconds]: [f64; 3]) {
         let row = (stream * 7 + number) % FRAMES;
         pb::view::View::Feature(pb::Feature {
             values: features.rows().row(row).to_vec(),
-            source_name: String::new(),
+            feature_set: String::new(),
         })
     });
     let config = pb::TrackConfig {

@@ -32,10 +32,10 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
         .navigate(pb::NavigateRequest {
             room: room.clone(),
             source: Some(frame(100)),
-            displacement: Some(pb::Displacement {
-                displacement: Some(pb::displacement::Displacement::Twist(
-                    convert::twist_to_wire(&motion),
-                )),
+            motion: Some(pb::RequestedMotion {
+                motion: Some(pb::requested_motion::Motion::Twist(convert::twist_to_wire(
+                    &motion,
+                ))),
             }),
             steps: Some(4),
             step_mode: pb::StepMode::ClosedLoop.into(),

@@ -11,7 +11,7 @@ use seese3_core::adapter::{Preset, Reading};
 use seese3_core::cancel::Cancellation;
 use seese3_core::features::Features;
 use seese3_core::navigation::{
-    Displacement, FitOn, IndexKind, Limits, Mode, Navigator, Query, RetrievalMetric, Source,
+    FitOn, IndexKind, Limits, Mode, Navigator, Query, RequestedMotion, RetrievalMetric, Source,
     SourceAt, StepKind,
 };
 use seese3_core::ndarray::Array2;
@@ -67,7 +67,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             source: Source::Frame(FrameId(50)),
             pose: None,
         },
-        displacement: Displacement::TargetFrame(FrameId(70)),
+        motion: RequestedMotion::TargetFrame(FrameId(70)),
         steps: 4,
         mode: Mode::OpenLoop,
         step: StepKind::InversePoincare(Reading::Homogeneous),

@@ -11,6 +11,7 @@ use super::progress::bar;
 use super::protocol::ProtocolOptions;
 use super::rooms::{data, load_rooms, room_words};
 use super::store_option::StoreAndJson;
+use crate::table_files::TableFiles;
 use seese3_core::eval::{Protocol, check_thresholds};
 use seese3_core::features::Features;
 use seese3_core::navigation::{NavigatorKind, RetrievalMetric, StepKind};
@@ -28,6 +29,8 @@ use seese3_store::StoredRoom;
 pub struct CrossRoom {
     #[command(flatten)]
     common: StoreAndJson,
+    #[command(flatten)]
+    files: TableFiles,
     /// Training rooms: names, or patterns with *; may be given several times
     #[arg(long, required = true)]
     train: Vec<String>,
@@ -106,6 +109,7 @@ impl CrossRoom {
     )]
     pub async fn run(self) -> anyhow::Result<()> {
         let store = self.common.open()?;
+        self.files.begin()?;
         let train = load_rooms(&store, &self.train, self.features.as_deref()).await?;
         let source = train[0].1.source().name.clone();
 
@@ -341,7 +345,8 @@ impl CrossRoom {
             last.seed
         ));
 
-        say(cross_room_table(last, &self.baseline, self.threshold));
+        let table = cross_room_table(last, &self.baseline, self.threshold);
+        self.files.say(&table, "held-out rooms")?;
         if self.rooms {
             say(rooms_table(last));
         }

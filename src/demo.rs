@@ -346,10 +346,8 @@ async fn ask(
         source: Some(pb::View {
             view: Some(pb::view::View::FrameId(source)),
         }),
-        displacement: Some(pb::Displacement {
-            displacement: Some(pb::displacement::Displacement::TargetFrameId(
-                source + STRIDE,
-            )),
+        motion: Some(pb::RequestedMotion {
+            motion: Some(pb::requested_motion::Motion::TargetFrameId(source + STRIDE)),
         }),
         steps: Some(STEPS),
         step_mode: pb::StepMode::ClosedLoop.into(),

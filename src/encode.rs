@@ -67,7 +67,7 @@ impl Encode {
         reason = "one command, from its arguments to what it prints"
     )]
     pub async fn run(self) -> anyhow::Result<()> {
-        let store = self.common.open()?;
+        let store = self.common.open_to_publish().await?;
         let runtime = self.runtime.runtime();
         let encoder = self.encoder.open(&self.model, &runtime)?;
         let stored = store.load_room(&self.room, None).await?;

@@ -129,6 +129,9 @@ store verify
   seese3 store verify --store store
 push
   seese3 push --store store rooms/kitchen --server 127.0.0.1:50051 --fit
+pull
+  seese3 pull --store store rooms/kitchen --server 127.0.0.1:50051
+  seese3 pull --store store adapters/base/revisions/2 --as base-2
 config
   seese3 config check --store store --config server.toml
   seese3 config print --store store

@@ -2,7 +2,6 @@
 
 use clap::Args;
 use indicatif::ProgressBar;
-use serde::Serialize;
 use serde_json::json;
 
 use seese3_core::cancel::Cancellation;
@@ -38,7 +37,7 @@ pub struct Fit {
 
 impl Fit {
     pub async fn run(self) -> anyhow::Result<()> {
-        let store = self.common.open()?;
+        let store = self.common.open_to_publish().await?;
         let request = fit_stored_room::Request {
             room: self.room,
             base: self.adapter,
@@ -67,7 +66,7 @@ impl Fit {
             "created": published.is_new,
             "room": refit.data().room.id().as_str(),
             "train_r2": fitted.record.train.overall,
-            "expected_errors": expected_errors(&fitted),
+            "expected_errors": fitted.rules.expected_errors(),
         }))
     }
 }
@@ -86,7 +85,7 @@ fn say_fitted(fitted: &Fitted, data: &RoomData<'_>) {
     say(
         "expected error of a view, by the distance of its feature from the nearest mapped feature:",
     );
-    for expected in expected_errors(fitted) {
+    for expected in fitted.rules.expected_errors() {
         say(format_args!(
             "  up to {:.3}: {:.3} m, {:.1}°",
             expected.feature_distance,
@@ -94,35 +93,6 @@ fn say_fitted(fitted: &Fitted, data: &RoomData<'_>) {
             expected.rotation_rad.to_degrees()
         ));
     }
-}
-
-/// The error that cross-validation leads to expect of views up to a distance from the map.
-#[derive(Debug, Serialize)]
-struct ExpectedError {
-    /// Largest distance of the view's feature from the nearest mapped feature, in standard
-    /// deviations of a feature column.
-    feature_distance: f64,
-    /// Root mean square of the position error, meters.
-    translation_m: f64,
-    /// Root mean square of the rotation error, radians.
-    rotation_rad: f64,
-}
-
-/// Expected errors at the median disagreement of the held-out views, nearest views first.
-fn expected_errors(fitted: &Fitted) -> Vec<ExpectedError> {
-    let expected = fitted.rules.rules().iter().map(|rule| {
-        // `least_disagreement` is a quarter of the median.
-        let median_disagreement = 4.0 * rule.least_disagreement;
-        let variances = rule
-            .covariance_at(rule.up_to, median_disagreement)
-            .diagonal();
-        ExpectedError {
-            feature_distance: rule.up_to,
-            translation_m: variances.fixed_rows::<3>(0).sum().sqrt(),
-            rotation_rad: variances.fixed_rows::<3>(3).sum().sqrt(),
-        }
-    });
-    expected.collect()
 }
 
 /// A progress bar over the epochs of a fit and its folds; empty without a fit.

@@ -8,6 +8,7 @@ use super::named::one_of;
 use super::output::{JsonOutput, say, say_published};
 use super::progress::bar;
 use super::rooms::room_names;
+use crate::table_files::TableFiles;
 use seese3_core::splits::HoldOut;
 use seese3_lab::experiments::tracked_room::{TrackedRoom, TrackingProtocol};
 use seese3_lab::experiments::tracking_fit::{PoseScores, RecordedRoom, fit, scores, trial_count};
@@ -39,13 +40,19 @@ pub struct FitTracking {
     #[command(flatten)]
     views: KeypointViews,
     #[command(flatten)]
+    files: TableFiles,
+    #[command(flatten)]
     json: JsonOutput,
 }
 
 impl FitTracking {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
+        self.files.begin()?;
         let store = Store::open(&self.store)?;
+        if self.publish {
+            store.check_writable().await?;
+        }
         let adapter = self.adapter.as_deref();
         let fitted = Recordings::load(&store, &self.rooms, adapter, &self.views).await?;
         let checked = if self.checks.is_empty() {
@@ -93,7 +100,7 @@ impl FitTracking {
         if let Some(checks) = &checks {
             add_scores(&mut table, "checked", checks);
         }
-        say(table);
+        self.files.say(&table, "parameters of filters")?;
 
         if self.publish {
             for name in room_names(&store, &self.rooms).await? {

@@ -27,6 +27,7 @@ const HEADINGS: [(&str, &[&str]); 4] = [
             "navigate",
             "plan",
             "push",
+            "pull",
         ],
     ),
     (

@@ -7,6 +7,8 @@ mod help;
 mod log;
 mod named;
 mod output;
+#[cfg(feature = "lab")]
+mod table_files;
 mod encoder;
 mod pose_options;
 mod store_option;
@@ -30,6 +32,7 @@ mod pose_report;
 #[cfg(feature = "lab")]
 mod probe;
 mod push;
+mod pull;
 #[cfg(feature = "lab")]
 mod reproduce;
 mod store;
@@ -133,6 +136,9 @@ enum Command {
     /// Show the whole pipeline on a synthetic room: render, train, serve and navigate
     Demo(demo::Demo),
     /// Read a recording from disk and publish it as a room in a store
+    ///
+    /// For a video or photographs without poses, `python -m seese3.mapping` of the Python package
+    /// estimates the poses and imports the room.
     Import(import::Import),
     /// Check a stored room: its camera path, and whether its poses agree with its images
     Check(check::Check),
@@ -181,6 +187,8 @@ enum Command {
     Store(store::StoreCommand),
     /// Upload a room or an adapter from a store to a server that was started with --writable
     Push(push::Push),
+    /// Download a room or an adapter from a server into a store
+    Pull(pull::Pull),
     /// Check or print the settings of `serve`
     Config(Box<config::Config>),
     /// Ask a server for the frames that a camera motion leads to
@@ -258,6 +266,7 @@ async fn dispatch(cli: Cli) -> anyhow::Result<()> {
         Command::Serve(arguments) => arguments.run().await,
         Command::Store(arguments) => arguments.run().await,
         Command::Push(arguments) => arguments.run().await,
+        Command::Pull(arguments) => arguments.run().await,
         Command::Config(arguments) => arguments.run(),
         Command::Navigate(arguments) => arguments.run().await,
         Command::Plan(arguments) => arguments.run().await,

@@ -123,6 +123,7 @@ impl Common {
     async fn open(&self) -> anyhow::Result<(Store, StoredRoom, RoomId)> {
         self.json.begin()?;
         let store = Store::open(&self.store)?;
+        store.check_writable().await?;
         let name = RoomId::new(&self.name).context("--name")?;
         let rooms = store.rooms().await?;
         if rooms.iter().any(|room| room.room == self.name) {

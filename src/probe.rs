@@ -10,6 +10,7 @@ use super::protocol::ProtocolOptions;
 use super::rooms::{data, load_rooms, room_words};
 use super::store_option::StoreAndJson;
 use super::with_causes;
+use crate::table_files::TableFiles;
 use seese3_core::features::Features;
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::training::{RoomData, TrainingPlan};
@@ -20,10 +21,14 @@ use seese3_lab::probes::{Counted, Duplicates, Limit, MutualKnn};
 use seese3_lab::report::{ProbeJson, ProbedRooms, probe_table};
 use seese3_store::StoredRoom;
 
+// M1 to M4 are the paper's, so M4 trains as the paper does, also in `sweep layers`.
 #[derive(Debug, Args)]
+#[command(mut_arg("preset", |preset| preset.default_value("paper-base")))]
 pub struct Probe {
     #[command(flatten)]
     common: StoreAndJson,
+    #[command(flatten)]
+    files: TableFiles,
     /// Rooms to probe: names, or patterns with *; may be given several times
     #[arg(long = "room", required = true)]
     rooms: Vec<String>,
@@ -64,9 +69,9 @@ pub struct Probe {
     /// M1: count a frame at exactly the distance --m1-exclusion as a neighbor
     #[arg(long)]
     m1_exclusive: bool,
-    /// M2: frames to each side that do not count as neighbors. The paper uses 0, which measures the
-    /// dimension of the camera path rather than that of the room
-    #[arg(long, default_value_t = 0)]
+    /// M2: frames to each side that do not count as neighbors. 0 measures the dimension of the
+    /// camera path rather than that of the room
+    #[arg(long, default_value_t = 10)]
     m2_gap: usize,
     /// M2: keep the first of identical rows, instead of dropping all of them
     #[arg(long)]
@@ -98,6 +103,7 @@ type Loaded = (StoredRoom, Features);
 impl Probe {
     pub async fn run(self) -> anyhow::Result<()> {
         let store = self.common.open()?;
+        self.files.begin()?;
         let rooms = load_rooms(&store, &self.rooms, self.features.as_deref()).await?;
 
         // M3 and M4 are scored on test pairs; M1 and M2 need no split.
@@ -140,7 +146,10 @@ impl Probe {
             self.seeds
         ));
 
-        say(probe_table(&scores));
+        self.files.say(
+            &probe_table(&scores),
+            &format!("features {}", rooms[0].1.source().name),
+        )?;
         skipped
             .iter()
             .for_each(|why| say(format_args!("skipped: {why}")));

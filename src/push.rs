@@ -1,23 +1,18 @@
 //! `seese3 push`: uploads a room or an adapter to a server.
 
+use std::sync::Arc;
+
 use anyhow::bail;
 use clap::Args;
 use serde_json::json;
-use sha2::{Digest, Sha256};
 
 use super::ask::Server;
 use super::output::say;
 use super::store_option::StoreAndJson;
 use seese3_client::Client;
 use seese3_client::proto::v1 as pb;
-use seese3_core::features::Features;
-use seese3_core::geometry::Pose;
-use seese3_server::{camera_to_wire, source_to_wire};
-use seese3_store::{KeypointsHeader, Kind, ResourceName, RoomKeypoints, StoredRoom};
-
-/// Target size of a message, bytes, well below the servers' limit. A message holds at least one
-/// frame.
-const MESSAGE_BYTES: usize = 1 << 20;
+use seese3_server::{MESSAGE_BYTES, RoomPart, RoomParts, room_upload};
+use seese3_store::{Kind, ResourceName, StoredRoom};
 
 #[derive(Debug, Args)]
 pub struct Push {
@@ -63,7 +58,8 @@ impl Push {
             Kind::Room => {
                 let stored = store.load_room(&self.name.name, self.name.revision).await?;
                 has_keypoints = stored.keypoints.is_some();
-                let messages = room_messages(&stored, self.upload(&stored, &target)?)?;
+                let upload = self.upload(&stored, &target)?;
+                let messages = room_messages(stored, upload)?;
                 let answer = client.upload_room(tokio_stream::iter(messages)).await;
                 let answer = answer.map_err(unanswered)?;
                 (answer.revision, answer.created, answer.served)
@@ -141,36 +137,18 @@ impl Push {
 
     /// The description of a room's upload.
     fn upload(&self, stored: &StoredRoom, target: &ResourceName) -> anyhow::Result<pb::RoomUpload> {
-        let provenance = stored.room.provenance();
-        // An extended room keeps its own format and license.
-        let own = |words: &String| {
-            if self.extend {
-                String::new()
-            } else {
-                words.clone()
-            }
-        };
-
-        let keypoints = match &stored.keypoints {
-            Some(keypoints) => Some(keypoints_upload(stored, keypoints)?),
-            None => None,
-        };
-
+        let mut upload = room_upload(stored)?;
+        if self.extend {
+            // An extended room keeps its own format and license.
+            upload.format.clear();
+            upload.license.clear();
+        }
         Ok(pb::RoomUpload {
             room: target.name.clone(),
             mode: self.mode().into(),
-            features: stored
-                .features
-                .iter()
-                .map(|set| source_to_wire(set.source()))
-                .collect(),
-            format: own(&provenance.format),
-            license: own(&provenance.licence),
-            camera: provenance.camera.as_ref().map(camera_to_wire),
             validate_only: self.dry_run,
             drop_other_features: self.drop_other_features,
-            keypoints,
-            ..pb::RoomUpload::default()
+            ..upload
         })
     }
 }
@@ -203,47 +181,8 @@ fn unanswered(error: seese3_client::Error) -> anyhow::Error {
     )
 }
 
-/// The description of a room's keypoints.
-fn keypoints_upload(
-    stored: &StoredRoom,
-    keypoints: &RoomKeypoints,
-) -> anyhow::Result<pb::KeypointsUpload> {
-    let KeypointsHeader {
-        source,
-        camera,
-        unit_m,
-        epipolar_px,
-        noise,
-    } = keypoints.header();
-
-    // The upload states one camera for the room and its keypoints, and the features by their name.
-    let features = stored.features(&source.feature.name);
-    if features.map(Features::source) != Some(&source.feature) {
-        bail!(
-            "the room's keypoints belong to features '{}', which it does not have; encode it again",
-            source.feature.name
-        );
-    }
-    if stored.room.provenance().camera != Some(camera) {
-        bail!("the room's keypoints were made with another camera; encode it again");
-    }
-
-    Ok(pb::KeypointsUpload {
-        features: source.feature.name,
-        positions: source.positions,
-        reliability: source.reliability,
-        descriptors: source.descriptors,
-        unit_m,
-        epipolar_px,
-        design_effect: noise.design_effect,
-        gap_scale: noise.gap_scale,
-        pose_noise: noise.pose_noise,
-        relative_error: noise.relative_error,
-    })
-}
-
 /// The resource name on the server. `renamed` is a plain name, or one with its collection.
-fn target(source: &ResourceName, renamed: Option<&str>) -> anyhow::Result<ResourceName> {
+pub fn target(source: &ResourceName, renamed: Option<&str>) -> anyhow::Result<ResourceName> {
     let collection = source.kind.collection();
     let name = match renamed {
         None => source.name.clone(),
@@ -256,81 +195,22 @@ fn target(source: &ResourceName, renamed: Option<&str>) -> anyhow::Result<Resour
     Ok(format!("{collection}/{name}").parse()?)
 }
 
-/// The messages of a room upload. The protocol does not carry a dataset's frame numbers, held-out
-/// marks, image paths or the path of the keypoints' model.
+/// The messages of a room upload.
 fn room_messages(
-    stored: &StoredRoom,
+    stored: StoredRoom,
     upload: pb::RoomUpload,
-) -> anyhow::Result<Vec<pb::UploadRoomRequest>> {
+) -> anyhow::Result<impl Iterator<Item = pb::UploadRoomRequest> + Send + 'static> {
     use pb::upload_room_request::Message;
 
-    if stored.features.is_empty() {
-        bail!("the room has no features; compute them with `seese3 encode`");
-    }
-
-    let columns: usize = stored.features.iter().map(|set| set.rows().ncols()).sum();
-    let at_once = (MESSAGE_BYTES / (128 + 4 * columns)).max(1);
-    let frame_count = stored.room.frame_count();
-    let keypoints = match (&upload.keypoints, &stored.keypoints) {
-        (Some(_), Some(keypoints)) => keypoints.to_bytes()?,
-        _ => Vec::new(),
-    };
-    let mut digest = Sha256::new();
-    let mut messages = vec![Message::Room(upload)];
-
-    for first in (0..frame_count).step_by(at_once) {
-        let batch = batch(stored, first..(first + at_once).min(frame_count));
-        digest.update(&batch.poses);
-        batch.features.iter().for_each(|rows| digest.update(rows));
-        messages.push(Message::Frames(batch));
-    }
-    digest.update(&keypoints);
-    let parts = keypoints.chunks(MESSAGE_BYTES);
-    messages.extend(parts.map(|part| Message::Keypoints(part.to_vec())));
-    messages.push(Message::End(pb::UploadEnd {
-        frame_count: frame_count as u32,
-        sha256: digest.finalize().to_vec(),
-    }));
-
-    Ok(messages
-        .into_iter()
-        .map(|message| pb::UploadRoomRequest {
-            message: Some(message),
-        })
-        .collect())
-}
-
-fn batch(stored: &StoredRoom, rows: std::ops::Range<usize>) -> pb::FrameBatch {
-    /// The given rows of a column; empty if the room has no such column.
-    fn part<T: Clone>(column: &[T], rows: &std::ops::Range<usize>) -> Vec<T> {
-        column.get(rows.clone()).unwrap_or_default().to_vec()
-    }
-
-    let pose_bytes = |pose: &Pose| {
-        // nalgebra matrices are column-major; the transpose gives the row-major order of NumPy.
-        let matrix = pose.to_homogeneous().transpose();
-        let numbers = matrix.iter().flat_map(|number| number.to_le_bytes());
-        numbers.collect::<Vec<u8>>()
-    };
-    let feature_bytes = |set: &Features| {
-        let part = set.rows().slice_move(ndarray::s![rows.clone(), ..]);
-        part.iter()
-            .flat_map(|number| number.to_le_bytes())
-            .collect()
-    };
-
-    let frames = stored.room.frames();
-    pb::FrameBatch {
-        poses: frames.poses[rows.clone()]
-            .iter()
-            .flat_map(pose_bytes)
-            .collect(),
-        features: stored.features.iter().map(feature_bytes).collect(),
-        images: Vec::new(),
-        timestamps_ns: part(&frames.timestamps_ns, &rows),
-        frame_names: part(&frames.names, &rows),
-        segments: part(&frames.sequences, &rows),
-    }
+    let parts = RoomParts::new(Arc::new(stored))?.map(|part| match part {
+        RoomPart::Frames(batch) => Message::Frames(batch),
+        RoomPart::Keypoints(part) => Message::Keypoints(part),
+        RoomPart::End(end) => Message::End(end),
+    });
+    let messages = std::iter::once(Message::Room(upload)).chain(parts);
+    Ok(messages.map(|message| pb::UploadRoomRequest {
+        message: Some(message),
+    }))
 }
 
 fn adapter_messages(upload: pb::AdapterUpload, weights: &[u8]) -> Vec<pb::UploadAdapterRequest> {

@@ -1,18 +1,22 @@
 //! `seese3 reproduce`: the paper's tables and figures on given rooms, as one report.
 
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context, bail};
 use clap::Args;
 use serde::Serialize;
+use serde_json::{Value, json};
+use tokio::runtime::Handle;
 
+use seese3_core::adapter::{Adapter, TrainingRecord};
 use seese3_core::features::Features;
 use seese3_core::image::RgbImage;
 use seese3_core::room::{FrameId, Room, is_plain_name};
 use seese3_lab::report::Document;
 use seese3_lab::reproduction::{
-    EXPERIMENTS, FeatureSet, Images, Options, Reproduced, ReproducedAdapter, Reproduction,
+    EXPERIMENTS, FeatureSet, Images, Journal, Options, Reproduced, ReproducedAdapter, Reproduction,
     ReproductionRecord, adapter_names, check, reproduce,
 };
 
@@ -61,7 +65,8 @@ pub struct Reproduce {
     /// Epochs, instead of every preset's own; for a quick trial
     #[arg(long)]
     epochs: Option<usize>,
-    /// Folder of the report; created if it does not exist
+    /// Folder of the report; created if it does not exist. Until the report is complete, it has
+    /// finished steps and trained adapters in `steps`; the same command goes on from there
     #[arg(long, default_value = "reproduction")]
     out: PathBuf,
     #[command(flatten)]
@@ -100,9 +105,12 @@ impl Reproduce {
         self.json.begin()?;
         let begun = Instant::now();
         let store = Store::open(&self.store)?;
+        store.check_writable().await?;
         let sets = self.load(&store).await?;
+        let journal = FolderJournal::open(&self.out.join(STEPS), &self.identity(&sets)?)?;
         let reproduction = Reproduction {
             options: self.options(),
+            journal: &journal,
             sets: sets.iter().map(LoadedSet::borrowed).collect(),
             images: Images {
                 read: &recorded_image,
@@ -117,15 +125,17 @@ impl Reproduce {
                 bail!("adapter name '{name}' is not valid: give shorter --features or --in-room");
             }
         }
-        std::fs::create_dir_all(&self.out)
-            .with_context(|| format!("{} cannot be created", self.out.display()))?;
-
         let progress = bar(EXPERIMENTS, "reproduce");
+        let begin = |step: &'static str| {
+            progress.set_message(step);
+            progress.inc(1);
+        };
+        // The journal waits for its store on this thread.
         let Reproduced {
             document,
             record,
             adapters,
-        } = reproduce(&reproduction, &|| progress.inc(1))?;
+        } = tokio::task::block_in_place(|| reproduce(&reproduction, &begin))?;
         progress.finish_and_clear();
 
         // A run that fails before this point publishes nothing.
@@ -137,7 +147,28 @@ impl Reproduce {
         };
 
         write(&self.out, &document, &record)?;
+        journal.finish()?;
         self.json.write(&record)
+    }
+
+    /// What a run depends on: the program, the options, and the revisions of the rooms. Only a run of
+    /// the same identity goes on where another one stopped.
+    fn identity(&self, sets: &[LoadedSet]) -> anyhow::Result<Value> {
+        let rooms = |rooms: &[Loaded]| -> Vec<String> {
+            let named = rooms.iter().map(|(stored, features)| {
+                let source = features.source();
+                format!("{} {} {source:?}", stored.room.id(), stored.revision)
+            });
+            named.collect()
+        };
+        let sets = sets.iter().map(|set| {
+            json!({ "train": rooms(&set.train), "test": rooms(&set.test), "in_room": rooms(&set.in_room) })
+        });
+        Ok(json!({
+            "version": env!("CARGO_PKG_VERSION"),
+            "options": serde_json::to_value(self.options())?,
+            "sets": sets.collect::<Vec<_>>(),
+        }))
     }
 
     fn options(&self) -> Options {
@@ -164,6 +195,98 @@ impl Reproduce {
         }
 
         Ok(sets)
+    }
+}
+
+/// The folder of finished steps, in that of the report.
+const STEPS: &str = "steps";
+
+/// A journal in a folder: a JSON file for each finished step, and a store of trained adapters.
+struct FolderJournal {
+    folder: PathBuf,
+    store: Store,
+    runtime: Handle,
+}
+
+impl FolderJournal {
+    /// Opens the journal of a run, or begins one.
+    fn open(folder: &Path, identity: &Value) -> anyhow::Result<Self> {
+        let adapters = folder.join("adapters");
+        std::fs::create_dir_all(&adapters)
+            .with_context(|| format!("{} cannot be created", folder.display()))?;
+        let file = folder.join("run.json");
+        if file.exists() {
+            let bytes = seese3_files::read(&file, seese3_files::SMALL_FILE_BYTES);
+            let bytes = bytes.with_context(|| file.display().to_string())?;
+            let known: Value = serde_json::from_slice(&bytes)
+                .with_context(|| format!("{} is damaged", file.display()))?;
+            if known != *identity {
+                bail!(
+                    "{} has steps of a run with other options, rooms or another version; give another --out, or remove \
+                     that folder",
+                    folder.display()
+                );
+            }
+            say(format_args!("going on from {}", folder.display()));
+        } else {
+            write_json(&file, identity)?;
+        }
+
+        let location = adapters.to_str().context("--out is not UTF-8")?;
+        Ok(Self {
+            folder: folder.to_owned(),
+            store: Store::open(location)?,
+            runtime: Handle::current(),
+        })
+    }
+
+    fn file(&self, step: &str) -> PathBuf {
+        self.folder.join(format!("{step}.json"))
+    }
+
+    /// Removes the journal of a complete run.
+    fn finish(self) -> anyhow::Result<()> {
+        std::fs::remove_dir_all(&self.folder)
+            .with_context(|| format!("{} cannot be removed", self.folder.display()))
+    }
+}
+
+impl Journal for FolderJournal {
+    fn step(&self, name: &str) -> Result<Option<Value>, String> {
+        let file = self.file(name);
+        let bytes = match std::fs::read(&file) {
+            Ok(bytes) => bytes,
+            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
+            Err(error) => return Err(format!("{}: {error}", file.display())),
+        };
+        let step = serde_json::from_slice(&bytes);
+        step.map_err(|error| format!("{}: {error}; remove it", file.display()))
+    }
+
+    fn keep_step(&self, name: &str, step: &Value) -> Result<(), String> {
+        write_json(&self.file(name), step).map_err(|error| format!("{error:#}"))
+    }
+
+    fn adapter(&self, name: &str) -> Result<Option<(Adapter, TrainingRecord)>, String> {
+        match self.runtime.block_on(self.store.load_adapter(name, None)) {
+            Ok(stored) => Ok(Some((stored.adapter.as_ref().clone(), stored.record))),
+            Err(seese3_store::Error::Unknown { .. }) => Ok(None),
+            Err(error) => Err(error.to_string()),
+        }
+    }
+
+    fn keep_adapter(&self, adapter: &ReproducedAdapter) -> Result<(), String> {
+        let ReproducedAdapter {
+            name,
+            adapter,
+            record,
+            golden_features,
+        } = adapter;
+        let published = self
+            .store
+            .publish_adapter(name, adapter, record, golden_features.view());
+        let published = self.runtime.block_on(published);
+        published.map(drop).map_err(|error| error.to_string())
     }
 }
 

@@ -23,4 +23,12 @@ impl StoreAndJson {
         self.json.begin()?;
         Ok(Store::open(&self.store)?)
     }
+
+    /// Opens the store of a command that publishes in it. A store that cannot be written is refused
+    /// here, and not after minutes of computing.
+    pub async fn open_to_publish(&self) -> anyhow::Result<Store> {
+        let store = self.open()?;
+        store.check_writable().await?;
+        Ok(store)
+    }
 }

@@ -3,8 +3,9 @@
 use anyhow::bail;
 use clap::Args;
 
-use super::output::{JsonOutput, say};
+use super::output::JsonOutput;
 use super::progress::bar;
+use crate::table_files::TableFiles;
 use seese3_lab::report::{theory_json, theory_table};
 use seese3_lab::theory::{Effort, checks};
 
@@ -20,12 +21,15 @@ pub struct Theory {
     #[arg(long, default_value_t = 200, value_parser = clap::value_parser!(u32).range(8..=100_000))]
     samples: u32,
     #[command(flatten)]
+    files: TableFiles,
+    #[command(flatten)]
     json: JsonOutput,
 }
 
 impl Theory {
     pub fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
+        self.files.begin()?;
 
         let effort = Effort {
             seed: self.seed,
@@ -41,7 +45,8 @@ impl Theory {
         })?;
 
         progress.finish_and_clear();
-        say(theory_table(&found));
+        self.files
+            .say(&theory_table(&found), "theory: measured values and bounds")?;
         self.json.write(&theory_json(&found))?;
 
         // The table and the file show every check; the exit status reports whether all bounds hold.

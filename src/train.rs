@@ -67,6 +67,7 @@ impl Train {
         self.json.begin()?;
 
         let store = Store::open(&self.store)?;
+        store.check_writable().await?;
         let rooms = load_rooms(&store, &self.rooms, self.features.as_deref()).await?;
 
         let plan = TrainingPlan {

@@ -4,6 +4,7 @@ use clap::Args;
 
 use super::{Server, revision_text, value_text, wire_json};
 use crate::output::{JsonOutput, say};
+use seese3_client::proto::v1 as pb;
 use serde_json::json;
 
 #[derive(Debug, Args)]
@@ -23,15 +24,16 @@ impl Catalog {
 
         for room in &rooms {
             let features: Vec<String> = room
-                .features
+                .feature_sources
                 .iter()
                 .map(|source| format!("{} ({})", source.name, source.dim))
                 .collect();
 
             say(format_args!(
-                "room {}: {} frames, features {}; adapters {}",
+                "room {}: {} frames{}, features {}; adapters {}",
                 revision_text(&room.name, room.revision),
                 room.frame_count,
+                extent_text(room),
                 features.join(", "),
                 room.adapters.join(", ")
             ));
@@ -61,4 +63,24 @@ impl Catalog {
             "adapters": adapters.collect::<anyhow::Result<Vec<_>>>()?,
         }))
     }
+}
+
+/// The extent, duration and frame rate of a room's recording, each with a comma before it.
+fn extent_text(room: &pb::Room) -> String {
+    let mut text = String::new();
+    if let Some(pb::Extent {
+        min: Some(min),
+        max: Some(max),
+    }) = &room.extent
+    {
+        let [x, y, z] = [max.x - min.x, max.y - min.y, max.z - min.z];
+        text += &format!(", {x:.1} × {y:.1} × {z:.1} m");
+    }
+    if let Some(duration) = room.duration_s {
+        text += &format!(", {duration:.1} s");
+    }
+    if let Some(rate) = room.frame_rate_hz {
+        text += &format!(", {rate:.1} Hz");
+    }
+    text
 }

@@ -145,7 +145,7 @@ impl ViewCamera {
 
         let camera = match self {
             Self::Stated(CameraOption(camera)) => Camera::Intrinsics(camera_to_wire(&camera)),
-            Self::Mapping => Camera::MappingCamera(true),
+            Self::Mapping => Camera::MappingCamera(pb::MappingCamera {}),
         };
         pb::ViewCamera {
             camera: Some(camera),
@@ -215,11 +215,11 @@ fn feature_view(file: &Path, row: usize) -> anyhow::Result<pb::View> {
         );
     }
 
-    // A NumPy file does not name its encoder, so the source name stays empty and the server can
+    // A NumPy file does not name its features, so the name of the set stays empty and the server can
     // only check the width.
     let feature = pb::Feature {
         values: features.row(row).to_vec(),
-        source_name: String::new(),
+        feature_set: String::new(),
     };
 
     Ok(pb::View {

@@ -6,13 +6,12 @@ use anyhow::{Context, bail};
 use clap::Args;
 
 use super::{
-    Server, diagonal, error_text, feature_view, frame_view, image_view, motion_text, revision,
-    wire_json,
+    Server, ViewCamera, diagonal, error_text, feature_view, frame_view, image_view, motion_text,
+    revision, wire_json,
 };
-use crate::camera::{CAMERA_FORM, CameraOption};
+use crate::camera::CAMERA_FORM;
 use crate::output::{JsonOutput, say};
 use seese3_client::proto::v1 as pb;
-use seese3_server::camera_to_wire;
 
 #[derive(Debug, Args)]
 pub struct Motion {
@@ -39,10 +38,11 @@ pub struct Motion {
         conflicts_with = "feature_file"
     )]
     images: Option<Vec<PathBuf>>,
-    /// Camera of --images, as --camera of `seese3 import`. With it, a server with the encoder of a
-    /// room's keypoints matches the keypoints of the images, unless --adapter is given
+    /// Camera of --images, as --camera of `seese3 import`, or "mapping" for the camera that mapped
+    /// the room. With it, a server with the encoder of a room's keypoints matches the keypoints of
+    /// the images, unless --adapter is given
     #[arg(long, value_name = CAMERA_FORM, requires = "images")]
-    camera: Option<CameraOption>,
+    camera: Option<ViewCamera>,
     /// A NumPy file of features, shape (n, d); --rows chooses two
     #[arg(long, value_name = "FILE", requires = "rows")]
     feature_file: Option<PathBuf>,
@@ -82,9 +82,7 @@ impl Motion {
         self.json.begin()?;
 
         let (first, second) = self.views()?;
-        let camera = self
-            .camera
-            .map(|CameraOption(camera)| camera_to_wire(&camera));
+        let camera = self.camera.map(ViewCamera::to_wire);
 
         let request = pb::EstimateMotionRequest {
             adapter: self.adapter,

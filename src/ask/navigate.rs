@@ -64,7 +64,7 @@ pub struct Navigate {
 
 impl Navigate {
     pub async fn run(self) -> anyhow::Result<()> {
-        use pb::displacement::Displacement;
+        use pb::requested_motion::Motion;
 
         self.json.begin()?;
 
@@ -74,9 +74,9 @@ impl Navigate {
             "--from FRAME, --feature-file FILE --row ROW or --image FILE is required",
         )?;
 
-        let displacement = match (self.to, &self.twist) {
-            (Some(frame), _) => Displacement::TargetFrameId(frame),
-            (None, Some(numbers)) => Displacement::Twist(twist(numbers)?),
+        let motion = match (self.to, &self.twist) {
+            (Some(frame), _) => Motion::TargetFrameId(frame),
+            (None, Some(numbers)) => Motion::Twist(twist(numbers)?),
             (None, None) => bail!("--to FRAME or --twist vx,vy,vz,wx,wy,wz is required"),
         };
 
@@ -99,8 +99,8 @@ impl Navigate {
             room: self.room,
             adapter: self.adapter,
             source: Some(source),
-            displacement: Some(pb::Displacement {
-                displacement: Some(displacement),
+            motion: Some(pb::RequestedMotion {
+                motion: Some(motion),
             }),
             steps: Some(self.steps),
             step_mode: mode.into(),
@@ -142,7 +142,7 @@ pub fn say_navigation(answer: &pb::NavigateResponse) {
         answer.navigator
     ));
 
-    if let Some(motion) = &answer.displacement {
+    if let Some(motion) = &answer.motion {
         say(format_args!("motion {}", motion_text(motion)));
     }
 

@@ -77,7 +77,7 @@ impl Plan {
             room: self.room,
             adapter: self.adapter,
             source: Some(source),
-            source_camera: self.camera.map(ViewCamera::to_wire),
+            camera: self.camera.map(ViewCamera::to_wire),
             goal: Some(goal),
             max_hop_length: self.max_hop_length,
             tolerance_m: self.tolerance_m,

@@ -28,6 +28,7 @@ use super::super::progress::bar;
 use super::keypoint_views::KeypointViews;
 use super::peer::{Peer, PeerTask};
 use super::room_images::RoomImages;
+use crate::table_files::TableFiles;
 use seese3_store::{Store, StoredRoom};
 
 /// Width of images that are drawn for the peer, pixels.
@@ -75,12 +76,15 @@ pub struct Localization {
     #[command(flatten)]
     views: KeypointViews,
     #[command(flatten)]
+    files: TableFiles,
+    #[command(flatten)]
     json: JsonOutput,
 }
 
 impl Localization {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
+        self.files.begin()?;
         let store = Store::open(&self.store)?;
         if self.adapter.is_none() && !self.fit {
             if self.features.is_some() {
@@ -123,7 +127,7 @@ impl Localization {
         progress.finish_and_clear();
 
         self.say_room(&stored, &features, found.mapped, found.asked);
-        say(localization_table(&found));
+        self.files.say(&localization_table(&found), &self.room)?;
 
         if let Some(rules) = &found.rules {
             say_rules(rules);
@@ -179,7 +183,9 @@ impl Localization {
         progress.finish_and_clear();
 
         self.say_room(&stored, features, found.mapped, found.all.n);
-        say(matched_localization_table(&found));
+        let (table, notes) = matched_localization_table(&found);
+        self.files.say(&table, &self.room)?;
+        say(notes);
         self.write::<MatchedLocalization>(features, &found)
     }
 

@@ -16,7 +16,7 @@ pub use keypoint_views::KeypointViews;
 pub use recordings::Recordings;
 
 use std::ffi::OsStr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use anyhow::{Context, bail};
@@ -25,6 +25,7 @@ use clap::{Args, Subcommand};
 use super::named::one_of;
 use super::output::{JsonOutput, STANDARD_OUTPUT, check_writable, say, write_file};
 use super::progress::bar;
+use crate::table_files::{plot_file, table_file};
 use seese3_core::adapter::TrainingRecord;
 use seese3_core::cancel::Cancellation;
 use seese3_core::eval::{
@@ -39,7 +40,8 @@ use seese3_core::splits::Split;
 use seese3_core::training::{motions, predictions};
 use seese3_lab::report::{
     AdapterJson, EvaluationContext, MotionBaselines, RoomJson, baselines_text, curve_thresholds,
-    evaluation_csv, evaluation_json, evaluation_latex, evaluation_table, hit_curves, report_at,
+    evaluation_csv, evaluation_json, evaluation_latex, evaluation_markdown, evaluation_table,
+    hit_curves, report_at,
 };
 use seese3_store::adapter_choice::{
     EvaluatedRoom, EvaluationCandidate, NoDefault, for_evaluation, serving_room,
@@ -147,30 +149,15 @@ struct Navigation {
     /// Plot Hit@ε against ε up to 1, one curve per navigator, to this SVG file
     #[arg(long, value_name = "FILE.svg", value_parser = plot_file)]
     plot: Option<PathBuf>,
-    /// Write the table to this file: .csv for programs, .tex for LaTeX with booktabs
-    #[arg(long, value_name = "FILE.csv|FILE.tex", value_parser = table_file)]
+    /// Also write the table to this file: .csv for programs, .tex for LaTeX with booktabs, .md for
+    /// Markdown
+    #[arg(long, value_name = "FILE", value_parser = table_file)]
     table: Option<PathBuf>,
     // Not flattened: clap could no longer detect whether any option of the table was given.
     /// Also write the results as JSON to this file. With "-" or no value, JSON goes to standard
     /// output, and no text is printed
     #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = STANDARD_OUTPUT)]
     json: Option<PathBuf>,
-}
-
-/// Accepts a file name that ends with .svg.
-fn plot_file(text: &str) -> Result<PathBuf, String> {
-    match Path::new(text).extension().and_then(OsStr::to_str) {
-        Some("svg") => Ok(PathBuf::from(text)),
-        _ => Err("must end with .svg".to_owned()),
-    }
-}
-
-/// Accepts a file name that ends with .csv or .tex.
-fn table_file(text: &str) -> Result<PathBuf, String> {
-    match Path::new(text).extension().and_then(OsStr::to_str) {
-        Some("csv" | "tex") => Ok(PathBuf::from(text)),
-        _ => Err("must end with .csv or .tex".to_owned()),
-    }
 }
 
 impl Navigation {
@@ -302,6 +289,7 @@ impl Navigation {
         if let Some(file) = &self.table {
             let text = match file.extension().and_then(OsStr::to_str) {
                 Some("tex") => evaluation_latex(report),
+                Some("md") => evaluation_markdown(report),
                 _ => evaluation_csv(report),
             };
             write_file(file, text.as_bytes())?;

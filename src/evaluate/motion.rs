@@ -11,6 +11,7 @@ use seese3_lab::report::{MotionEvaluationJson, motion_table};
 use super::super::output::{JsonOutput, say};
 use super::super::progress::bar;
 use super::keypoint_views::KeypointViews;
+use crate::table_files::TableFiles;
 use seese3_store::{Store, StoredAdapter};
 
 #[derive(Debug, Args)]
@@ -34,12 +35,15 @@ pub struct Motion {
     #[command(flatten)]
     views: KeypointViews,
     #[command(flatten)]
+    files: TableFiles,
+    #[command(flatten)]
     json: JsonOutput,
 }
 
 impl Motion {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
+        self.files.begin()?;
 
         let store = Store::open(&self.store)?;
         let stored = store.load_room(&self.room, None).await?;
@@ -98,7 +102,15 @@ impl Motion {
         if let Some((adapter, _)) = &adapter {
             say_adapter(adapter, in_room == Some(true));
         }
-        say(motion_table(&found));
+        let title = format!(
+            "{}: {} motions over {} frames",
+            self.room, found.n, self.stride
+        );
+        let (table, notes) = motion_table(&found);
+        self.files.say(&table, &title)?;
+        if !notes.is_empty() {
+            say(notes);
+        }
 
         self.json.write(&MotionEvaluationJson {
             found: &found,

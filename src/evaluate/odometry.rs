@@ -11,8 +11,8 @@ use seese3_lab::experiments::odometry::{Relocalisation, RoomOdometry, evaluate, 
 use seese3_lab::experiments::replay::Replay;
 use seese3_lab::experiments::tracked_room::TrackingProtocol;
 use seese3_lab::report::{
-    APE_FORMULA, coverage_table, intervals_table, odometry_json, odometry_table, other_rooms_text,
-    relocalisation_text, scenarios_text,
+    APE_FORMULA, Table, coverage_table, intervals_table, odometry_json, odometry_table,
+    other_rooms_text, relocalisation_text, scenarios_text,
 };
 use seese3_robot::pose_filter::FilterParameters;
 
@@ -21,6 +21,7 @@ use super::super::output::{JsonOutput, say, write_file};
 use super::super::progress::bar;
 use super::keypoint_views::KeypointViews;
 use super::recordings::Recordings;
+use crate::table_files::TableFiles;
 use seese3_data::export::{kitti_trajectory, tum_trajectory};
 use seese3_store::Store;
 
@@ -63,12 +64,15 @@ pub struct Odometry {
     #[command(flatten)]
     views: KeypointViews,
     #[command(flatten)]
+    files: TableFiles,
+    #[command(flatten)]
     json: JsonOutput,
 }
 
 impl Odometry {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
+        self.files.begin()?;
         let store = Store::open(&self.store)?;
         let given = self
             .parameters
@@ -142,13 +146,11 @@ impl Odometry {
             self.hold_out.name(),
         ));
 
-        let table = odometry_table(tracked).to_string();
-        let shown = if self.each || tracked.len() == 1 {
-            table
-        } else {
-            only_mean(&table)
-        };
-        say(shown);
+        let mut table = odometry_table(tracked);
+        if !self.each && tracked.len() > 1 {
+            table = only_mean(&table);
+        }
+        self.files.say(&table, what)?;
         say(format_args!("\ncovariances:\n{}", coverage_table(tracked)));
         say(format_args!(
             "\nbootstrap over rooms, and over 20 blocks of time in each:\n{}",
@@ -229,11 +231,11 @@ fn write_paths(folder: &Path, room: &str, replay: &Replay) -> anyhow::Result<()>
     Ok(())
 }
 
-/// The header of a table and its last line, the means.
-fn only_mean(table: &str) -> String {
-    let lines: Vec<&str> = table.lines().collect();
-    match lines.as_slice() {
-        [head, .., last] => format!("{head}\n{last}"),
-        _ => table.to_owned(),
+/// The last row of a table, the means.
+fn only_mean(table: &Table) -> Table {
+    let mut means = Table::new(&table.titles().join(" | "));
+    if let Some((name, cells)) = table.rows().last().and_then(|row| row.split_first()) {
+        means.row(name, cells.iter().cloned());
     }
+    means
 }

@@ -13,6 +13,7 @@ use super::super::output::{JsonOutput, say};
 use super::super::progress::bar;
 use super::super::rooms::{data, load_rooms};
 use super::say_leaks;
+use crate::table_files::TableFiles;
 use seese3_store::Store;
 
 #[derive(Debug, Args)]
@@ -44,12 +45,15 @@ pub struct Planning {
     #[arg(long, default_value_t = 0)]
     seed: u64,
     #[command(flatten)]
+    files: TableFiles,
+    #[command(flatten)]
     json: JsonOutput,
 }
 
 impl Planning {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
+        self.files.begin()?;
 
         let store = Store::open(&self.store)?;
         let stored = store.load_adapter(&self.adapter, None).await?;
@@ -78,7 +82,7 @@ impl Planning {
             stored.revision,
             self.hold_out.name(),
         ));
-        say(planning_table(&found));
+        self.files.say(&planning_table(&found), "routes")?;
 
         self.json
             .write(&planning_json(&found, &protocol, &stored.name))?;

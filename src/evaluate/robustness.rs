@@ -24,6 +24,7 @@ use super::super::rooms::{data, load_rooms, room_names};
 use super::keypoint_views::KeypointViews;
 use super::room_images::RoomImages;
 use super::say_leaks;
+use crate::table_files::TableFiles;
 use seese3_encoder::{EncodedFrame, Encoder};
 use seese3_store::Store;
 
@@ -51,6 +52,8 @@ pub struct Robustness {
     #[command(flatten)]
     views: KeypointViews,
     #[command(flatten)]
+    files: TableFiles,
+    #[command(flatten)]
     json: JsonOutput,
 }
 
@@ -60,6 +63,7 @@ const BATCH: usize = 16;
 impl Robustness {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
+        self.files.begin()?;
         let store = Store::open(&self.store)?;
         match (&self.adapter, &self.encoder) {
             (Some(adapter), Some(encoder)) => self.by_adapter(&store, adapter, encoder).await,
@@ -193,7 +197,7 @@ impl Robustness {
             "{rooms} rooms, {what}, hold-out {}; blank and frozen cameras are scored only while blank or frozen",
             self.hold_out.name(),
         ));
-        say(robustness_table(found));
+        self.files.say(&robustness_table(found), what)?;
         self.json
             .write(&robustness_json(found, adapter, self.hold_out))
     }

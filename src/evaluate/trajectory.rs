@@ -6,6 +6,7 @@ use anyhow::{Context, bail};
 use clap::Args;
 
 use super::super::output::{JsonOutput, say};
+use crate::table_files::TableFiles;
 use seese3_core::trajectory::{RpePairs, associate};
 use seese3_data::datasets::read_tum_trajectory;
 use seese3_lab::experiments::path_comparison::{PathComparison, PathProtocol};
@@ -24,6 +25,8 @@ pub struct EvaluateTrajectory {
     max_difference_ms: u64,
     #[command(flatten)]
     relative: RelativeOptions,
+    #[command(flatten)]
+    files: TableFiles,
     #[command(flatten)]
     json: JsonOutput,
 }
@@ -57,6 +60,7 @@ impl RelativeOptions {
 impl EvaluateTrajectory {
     pub fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
+        self.files.begin()?;
 
         let reference = read_tum_trajectory(&self.reference)?;
         let estimate = read_tum_trajectory(&self.estimate)?;
@@ -84,7 +88,10 @@ impl EvaluateTrajectory {
             errors.matched, errors.unmatched_reference, errors.unmatched_estimate
         ));
 
-        say(path_errors_table(&errors));
+        let title = format!("{} poses", errors.matched);
+        let (table, notes) = path_errors_table(&errors);
+        self.files.say(&table, &title)?;
+        say(notes);
         self.json.write(&path_errors_json(&errors))?;
 
         Ok(())

@@ -18,7 +18,7 @@ use seese3_core::features::{FeatureSource, Features};
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_data::datasets::{self, Reader, Recording, Unusable};
 use seese3_data::pose_check::{PoseReport, check_room};
-use seese3_store::{Store, check_features};
+use seese3_store::{OtherFeatures, RoomContents, Store, check_features};
 
 #[derive(Debug, Args)]
 pub struct Destination {
@@ -40,8 +40,12 @@ pub struct Destination {
     strict: bool,
     /// Publish a new revision even if the store has a room of this name with other frames; the
     /// features of the old frames are not carried over
-    #[arg(long)]
+    #[arg(long, conflicts_with = "extend")]
     replace: bool,
+    /// Append the frames to the room of this name; their poses must be in its world frame, and
+    /// --features must give every feature set that it has
+    #[arg(long)]
+    extend: bool,
     /// Publish the room although its images contradict its poses
     #[arg(long, conflicts_with = "strict")]
     allow_contradicted: bool,
@@ -82,8 +86,8 @@ impl Destination {
         }
 
         bail!(
-            "room '{}' is in the store with other frames ({} from {}, these are {}); give another --name, or --replace, \
-             which drops its features",
+            "room '{}' is in the store with other frames ({} from {}, these are {}); give another --name, or \
+             --replace, which drops its features, or --extend, which appends these frames",
             room.id(),
             before.frame_count(),
             before.provenance().format,
@@ -296,7 +300,10 @@ impl Destination {
         // The last checks come before the first write: a failed import publishes nothing.
         check_features(&room, &features)?;
         let store = Store::create(&self.store)?;
-        self.refuse_other_frames(&store, &room).await?;
+        store.check_writable().await?;
+        if !self.extend {
+            self.refuse_other_frames(&store, &room).await?;
+        }
 
         self.say_read(&room, &features, &recording, read_count);
         let from = PosesFrom::Recording(read_as);
@@ -317,9 +324,13 @@ impl Destination {
         self.refuse_contradicted(&store, &room, contradiction(&report, from))
             .await?;
         self.refuse_if_strict(&room, &report)?;
-        let published = match self.replace {
-            true => store.publish_room(&room, &features).await?,
-            false => store.publish_same_frames(&room, &features).await?,
+        let published = if self.extend {
+            let added = RoomContents::of(&room, &features);
+            store.extend_room(added, OtherFeatures::Required).await?
+        } else if self.replace {
+            store.publish_room(&room, &features).await?
+        } else {
+            store.publish_same_frames(&room, &features).await?
         };
 
         // Publishing the same content again creates no new revision, so an import can safely be

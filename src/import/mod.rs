@@ -3,12 +3,14 @@
 //! | file | what |
 //! | --- | --- |
 //! | here | the formats and their options |
+//! | `adapter` | adapters that another program trained |
 //! | `bag`, `numpy` | formats with more options |
 //! | `destination` | options and steps that all formats share |
 //! | `frame_summary` | the printed summary of the frames |
 
 #[cfg_attr(not(feature = "bags"), path = "bag_not_built.rs")]
 mod bag;
+mod adapter;
 mod destination;
 mod numpy;
 mod frame_summary;
@@ -43,7 +45,7 @@ enum Format {
     /// 7-Scenes: a scene's folder (seq-XX/frame-XXXXXX.pose.txt), or one sequence's
     #[command(name = "7scenes")]
     SevenScenes(Seven),
-    /// Your own folder: images/, and poses.npy (n, 4, 4) in the order of the image names
+    /// Your own folder: images/, and poses.npy (n, 4, 4) or (n, 3, 4) in the order of the image names
     Folder(Plain),
     /// COLMAP: a model (cameras and images, .bin or .txt), or a project's folder with sparse/0
     Colmap(Colmap),
@@ -55,10 +57,12 @@ enum Format {
     Euroc(Euroc),
     /// ROS 2 bag (.mcap, .db3) or Foxglove recording, with images and poses or /tf
     Bag(BagPath),
-    /// NumPy files: poses (n, 4, 4) world_from_camera in meters, features (n, d)
+    /// NumPy files: poses (n, 4, 4) or (n, 3, 4), world_from_camera in meters; features (n, d)
     Numpy(Numpy),
     /// A folder that `seese3 export numpy` wrote
     Bundle(Plain),
+    /// Not a room: an adapter that another program trained, for instance PyTorch
+    Adapter(adapter::ImportAdapter),
 }
 
 #[derive(Debug, Args)]
@@ -200,6 +204,7 @@ impl Import {
             }
             Format::Bag(bag) => bag.import().await,
             Format::Numpy(numpy) => numpy.import().await,
+            Format::Adapter(adapter) => adapter.run().await,
             Format::Bundle(plain) => {
                 plain
                     .import("bundle", |path, _| datasets::read_bundle(path))

@@ -14,6 +14,7 @@ use super::super::progress::bar;
 use super::super::protocol::ProtocolOptions;
 use super::super::rooms::{data, load_rooms};
 use super::journal::{self, SweepJournal};
+use crate::table_files::TableFiles;
 use seese3_core::adapter::{Loss, TrainConfig};
 use seese3_core::features::Features;
 use seese3_core::training::TrainingPlan;
@@ -68,6 +69,8 @@ pub struct Adapters {
     #[arg(long)]
     out: PathBuf,
     #[command(flatten)]
+    files: TableFiles,
+    #[command(flatten)]
     json: JsonOutput,
 }
 
@@ -81,6 +84,7 @@ struct Task<'a> {
 impl Adapters {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
+        self.files.begin()?;
         let (part, parts) = self.shard()?;
         self.protocol.needs_test_pairs()?;
         self.protocol.leaves_to_the_grid()?;
@@ -179,7 +183,8 @@ impl Adapters {
             base.stride
         ));
 
-        say(success_table(rows));
+        self.files
+            .say(&success_table(rows), "best run of each room")?;
         say("\nroom difficulty:");
         say(difficulty_table(rows));
 

@@ -7,6 +7,7 @@ use super::super::output::{JsonOutput, say};
 use super::super::progress::bar;
 use super::super::protocol::ProtocolOptions;
 use super::super::rooms::{data, load_rooms, room_words};
+use crate::table_files::TableFiles;
 use seese3_core::training::RoomData;
 use seese3_lab::experiments::formulations::{RoomPooling, compare};
 use seese3_lab::formulations::Formulation;
@@ -33,12 +34,15 @@ pub struct Formulations {
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=1_000))]
     seeds: u64,
     #[command(flatten)]
+    files: TableFiles,
+    #[command(flatten)]
     json: JsonOutput,
 }
 
 impl Formulations {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
+        self.files.begin()?;
 
         self.protocol.needs_test_pairs()?;
         let store = Store::open(&self.store)?;
@@ -88,7 +92,8 @@ impl Formulations {
                 .map_or(0, |run| run.n),
         ));
 
-        say(formulations_table(&comparison));
+        self.files
+            .say(&formulations_table(&comparison), "formulations")?;
         self.json.write(&comparison)?;
 
         Ok(())

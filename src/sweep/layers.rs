@@ -10,6 +10,7 @@ use super::super::named::one_of;
 use super::super::output::{JsonOutput, say};
 use super::super::progress::bar;
 use super::super::protocol::{SplitChoice, split_choice};
+use crate::table_files::TableFiles;
 use seese3_core::adapter::Preset;
 use seese3_core::features::Features;
 use seese3_core::splits::Split;
@@ -58,13 +59,15 @@ pub struct Layers {
     /// Frames to each side that do not count as neighbors, in M1
     #[arg(long, default_value_t = 10)]
     m1_exclusion: usize,
-    /// Frames to each side that do not count as neighbors, in M2; the paper's 0 measures the path
-    /// rather than the room
+    /// Frames to each side that do not count as neighbors, in M2. 0 measures the dimension of the
+    /// camera path rather than that of the room
     #[arg(long, default_value_t = 10)]
     m2_gap: usize,
     /// Also print one line per encoder, with its best layer, to compare checkpoints of one encoder
     #[arg(long)]
     by_encoder: bool,
+    #[command(flatten)]
+    files: TableFiles,
     #[command(flatten)]
     json: JsonOutput,
 }
@@ -76,6 +79,7 @@ impl Layers {
     )]
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
+        self.files.begin()?;
 
         ensure!(
             self.split != SplitChoice::One(Split::Whole),
@@ -152,12 +156,16 @@ impl Layers {
             self.seeds
         ));
 
-        say(layers_table(&scores));
+        self.files
+            .say(&layers_table(&scores), "layers: means over rooms")?;
         if self.by_encoder {
             say(encoders_table(&scores));
         }
 
-        say("* the best: M1 highest, M2 nearest to 6 (SE(3)), M3 and M4 highest; means over rooms");
+        say(
+            "* the best: M1 highest, M2 nearest to 6 (SE(3)), M3 and M4 highest and above the constant; by more than \
+             the deviation over rooms and seeds",
+        );
         self.json.write(&BTreeMap::from([("layers", scores)]))?;
 
         Ok(())

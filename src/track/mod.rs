@@ -190,7 +190,9 @@ impl Track {
             }
 
             match answer.answer {
-                Some(Answer::Started(started)) => heard.names = started.frames.unwrap_or_default(),
+                Some(Answer::Started(started)) => {
+                    heard.names = started.frame_names.unwrap_or_default()
+                }
                 Some(Answer::Update(update)) => {
                     if let Some(lines) = &mut lines {
                         lines.write(&wire_json("TrackUpdate", &update)?)?;
@@ -291,17 +293,8 @@ impl Track {
             pb::Fusion::Anchors
         };
 
-        use pb::view_camera::Camera;
-        let camera = self.camera.and_then(|camera| camera.to_wire().camera);
-        let (camera, mapping_camera) = match camera {
-            Some(Camera::Intrinsics(camera)) => (Some(camera), false),
-            Some(Camera::MappingCamera(_)) => (None, true),
-            None => (None, false),
-        };
-
         Ok(pb::TrackConfig {
-            camera,
-            mapping_camera,
+            camera: self.camera.map(ViewCamera::to_wire),
             room: self.room.clone().unwrap_or_default(),
             adapter: self.adapter.clone().unwrap_or_default(),
             fusion: fusion as i32,
@@ -402,7 +395,7 @@ impl RecordedView {
         match self {
             Self::Feature(values) => Some(pb::view::View::Feature(pb::Feature {
                 values: values.clone(),
-                source_name: String::new(),
+                feature_set: String::new(),
             })),
             Self::Image(file) => {
                 let bytes = seese3_files::read(file, seese3_files::IMAGE_FILE_BYTES).ok();

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use seese3_core::geometry::PoseError;
 use seese3_core::keypoints::KeypointSource;
 use seese3_robot::matched_views::MappedKeypoints;
 use seese3_store::{RoomContents, RoomKeypoints, Store, StoredRoom};
@@ -52,7 +53,7 @@ fn loaded(here: &Place, store: &str) -> StoredRoom {
 
 /// Oracle: the store from which the room is pushed.
 #[test]
-fn keypoints_are_pushed_with_their_room() {
+fn keypoints_are_pushed_and_pulled_with_their_room() {
     let here = place();
     let server = here.serve("--writable");
     let push = format!("push rooms/a --store source --server {}", server.address);
@@ -72,6 +73,41 @@ fn keypoints_are_pushed_with_their_room() {
     stated.source.clone_from(&sent.source);
     assert_eq!(stated, sent.header());
     here.succeeds("store verify --store store");
+
+    // And back, into another store.
+    let pull = format!("pull rooms/a --store copy --server {}", server.address);
+    here.prints(&pull, &["published room 'a' revision 1"]);
+    here.prints(&pull, &["already there, unchanged"]);
+    let [sent, arrived] = ["store", "copy"].map(|store| loaded(&here, store));
+    for (arrived, sent) in arrived.room.poses().iter().zip(sent.room.poses()) {
+        // A matrix on the way rounds a rotation.
+        let error = PoseError::between(arrived, sent);
+        assert!(error.translation_m < 1e-12 && error.rotation_rad < 1e-7);
+    }
+    assert_eq!(arrived.features[0].rows(), sent.features[0].rows());
+    let [sent, arrived] = [sent, arrived].map(|room| room.keypoints.unwrap());
+    assert_eq!(arrived.map.frames, sent.map.frames);
+    here.succeeds("store verify --store copy");
+
+    // A room of this name with other content stays, unless it is to be replaced.
+    let other = format!(
+        "pull rooms/r --as a --store copy --server {}",
+        server.address
+    );
+    here.refuses(
+        &other,
+        &["rooms/a is in the store", "--as NAME", "--replace"],
+    );
+    here.prints(
+        &format!("{other} --replace"),
+        &["published room 'a' revision 2"],
+    );
+    let missing = format!(
+        "pull rooms/nobody --store other --server {}",
+        server.address
+    );
+    here.refuses(&missing, &["'nobody' is not served"]);
+    assert!(!here.file("other").exists());
 }
 
 /// Oracle: the keypoints in the store, frame after frame.

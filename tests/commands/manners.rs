@@ -100,7 +100,7 @@ fn tables_and_plots_are_what_their_names_say() {
 
     let other = here.run(&format!("{evaluate} --table table.xlsx"));
     assert_eq!(other.status.code(), Some(2));
-    assert!(said(&other).contains(".csv or .tex"));
+    assert!(said(&other).contains(".csv or .tex or .md"));
 }
 
 #[test]

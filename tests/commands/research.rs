@@ -20,7 +20,7 @@ fn stored() -> Place {
 fn probe_writes_the_oracles_figures() {
     let here = stored();
 
-    let fixed = "probe --store store --room a --features fourier --json found.json";
+    let fixed = "probe --store store --room a --features fourier --m2-gap 0 --json found.json";
     let short = format!("{fixed} --epochs 1 --seeds 2");
     here.prints(&short, &["M2 TwoNN", "M4 s40"]);
 

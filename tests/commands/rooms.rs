@@ -97,6 +97,21 @@ fn recordings_are_imported_once_and_given_back() {
         "import numpy short --store store --every 2",
         &["6 poses but 2 timestamps", "short"],
     );
+
+    // Frames are appended to a room, once; and only to one that is there.
+    std::fs::remove_file(here.file("short/timestamps.npy")).unwrap();
+    std::fs::create_dir(here.file("more")).unwrap();
+    std::fs::copy(here.file("out/poses.npy"), here.file("more/poses.npy")).unwrap();
+    let extend = "import numpy more --store store --name short --extend";
+    here.refuses(extend, &["short"]);
+    here.succeeds("import numpy short --store store");
+    here.refuses(
+        "import numpy more --store store --name short",
+        &["--replace", "--extend"],
+    );
+    here.prints(extend, &["published revision 2"]);
+    here.prints(extend, &["already there, unchanged: revision 2"]);
+    here.prints("store list --store store", &["8 frames"]);
 }
 
 fn features(here: &Place, store: &str, room: &str, name: &str) -> Array2<f32> {

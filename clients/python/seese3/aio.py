@@ -29,6 +29,7 @@ from .requests import (
     Gravity,
     InertialSamples,
     InitialPose,
+    LocalizationQuery,
     NavigationQuery,
     Odometry,
     Prediction,
@@ -227,7 +228,8 @@ class AsyncClient:
             except (TypeError, ValueError) as error:
                 raise type(error)(f"queries[{number}]: {error}") from None
         request = navigation_pb2.BatchNavigateRequest(requests=batch)
-        return answers.batch_of(await self._ask(self._navigation.BatchNavigate, request, deadline_s))
+        answer = await self._ask(self._navigation.BatchNavigate, request, deadline_s)
+        return answers.batch_of(answers.Navigation, answer)
 
     async def plan_route(
         self,
@@ -292,7 +294,7 @@ class AsyncClient:
             adapter_revision=adapter_revision,
             source=wire_view(source),
             source_pose=None if source_pose is None else wire_pose(source_pose),
-            source_camera=requests.wire_view_camera(camera),
+            camera=requests.wire_view_camera(camera),
             goal_frame_id=requests.count(goal, "goal"),
             goal_pose=None if goal_pose is None else wire_pose(goal_pose),
             max_hop_length=max_hop_length,
@@ -345,16 +347,37 @@ class AsyncClient:
             >>> found = client.localize("photo.jpg", rooms="kitchen")
             >>> found.pose, found.covariance, found.novelty
         """
-        request = localization_pb2.LocalizeRequest(
-            rooms=requests.names(rooms),
-            room_revisions=room_revisions,
-            adapter=adapter,
-            adapter_revision=adapter_revision,
-            view=wire_view(view),
-            top_k=requests.count(top_k, "top_k"),
-            camera=requests.wire_view_camera(camera),
-        )
-        return answers.Localization.of(await self._ask(self._localization.Localize, request, deadline_s))
+        query = LocalizationQuery(view, rooms, room_revisions, adapter, adapter_revision, top_k, camera)
+        return answers.Localization.of(await self._ask(self._localization.Localize, query.request(), deadline_s))
+
+    async def localize_batch(
+        self, queries: Sequence[LocalizationQuery], *, deadline_s: float | None = None
+    ) -> list[answers.Localization | errors.RefusedError]:
+        """Localizes many views in one call.
+
+        Args:
+            queries: The queries; the server's limit is `server_info().limits["batch"]`.
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            One entry for each query, in order. A query that the server refuses has its exception in its place.
+
+        Raises:
+            RefusedError: The server refused the whole batch.
+            ValueError: A query is not valid; the message names it.
+
+        Example:
+            >>> client.localize_batch([LocalizationQuery(file, "kitchen", camera="mapping") for file in files])
+        """
+        batch = []
+        for number, query in enumerate(queries):
+            try:
+                batch.append(query.request())
+            except (TypeError, ValueError) as error:
+                raise type(error)(f"queries[{number}]: {error}") from None
+        request = localization_pb2.BatchLocalizeRequest(requests=batch)
+        answer = await self._ask(self._localization.BatchLocalize, request, deadline_s)
+        return answers.batch_of(answers.Localization, answer)
 
     async def relocalize(
         self,
@@ -418,7 +441,7 @@ class AsyncClient:
         room_revision: int | None = None,
         adapter: str | None = None,
         adapter_revision: int | None = None,
-        camera: Camera | None = None,
+        camera: Camera | Literal["mapping"] | None = None,
         deadline_s: float | None = None,
     ) -> answers.Motion:
         """Estimates the motion from one view to another.
@@ -431,7 +454,8 @@ class AsyncClient:
             adapter: The adapter; None for the default of the room, or the only adapter that is not fitted to a room.
                 Two images of a known camera need none.
             adapter_revision: The revision of `adapter`; None for the current one.
-            camera: The camera of both images; None for that of the room, if it is known.
+            camera: The camera of both images, or "mapping" for the one that mapped `room`; None for that of the room,
+                if it is known.
             deadline_s: Time limit of the call, seconds; None for that of the client.
 
         Returns:
@@ -450,7 +474,7 @@ class AsyncClient:
             adapter_revision=adapter_revision,
             first=wire_view(first),
             second=wire_view(second),
-            camera=requests.wire_camera(camera),
+            camera=requests.wire_view_camera(camera),
         )
         return answers.Motion.of(await self._ask(self._odometry.EstimateMotion, request, deadline_s))
 
@@ -839,6 +863,59 @@ class AsyncClient:
             _go_on(request, page.next_page_token)
         raise errors.AnswerError(f"the server's list has more than {MOST_PAGES} pages")
 
+    async def download_room(
+        self, room: str, *, revision: int | None = None, deadline_s: float | None = None
+    ) -> answers.DownloadedRoom:
+        """Downloads the frames and features of a room. For a copy in a store, use `seese3 pull`.
+
+        Args:
+            room: The room.
+            revision: The revision; None for the current one.
+            deadline_s: Time limit of the call, seconds; None for no limit.
+
+        Returns:
+            The room as arrays, without images.
+
+        Raises:
+            RefusedError: The server refused the request.
+            AnswerError: The download was damaged on its way.
+
+        Example:
+            >>> client.download_room("kitchen").features["efficientnet"].shape
+        """
+        request = catalog_pb2.DownloadRoomRequest(room=room, room_revision=revision)
+        timeout = channel.timeout(_no_limit(deadline_s))
+        call = self._catalog.DownloadRoom(request, timeout=timeout, metadata=self._metadata)
+        messages = [message async for message in self._listen(call)]
+        return answers.DownloadedRoom.of(messages)
+
+    async def download_adapter(
+        self, adapter: str, *, revision: int | None = None, deadline_s: float | None = None
+    ) -> tuple[bytes, bytes]:
+        """Downloads an adapter, for `upload_adapter`. For a copy in a store, use `seese3 pull`.
+
+        Args:
+            adapter: The adapter.
+            revision: The revision; None for the current one.
+            deadline_s: Time limit of the call, seconds; None for no limit.
+
+        Returns:
+            The manifest and the weights.
+
+        Raises:
+            RefusedError: The server refused the request.
+
+        Example:
+            >>> manifest, weights = client.download_adapter("robot")
+        """
+        request = catalog_pb2.DownloadAdapterRequest(adapter=adapter, adapter_revision=revision)
+        timeout = channel.timeout(_no_limit(deadline_s))
+        call = self._catalog.DownloadAdapter(request, timeout=timeout, metadata=self._metadata)
+        messages = [message async for message in self._listen(call)]
+        if not messages or not messages[0].HasField("adapter"):
+            raise errors.AnswerError("the download has no manifest")
+        return messages[0].adapter.manifest, b"".join(message.weights for message in messages[1:])
+
     async def upload_room(
         self,
         room: str,
@@ -883,7 +960,7 @@ class AsyncClient:
         described = catalog_pb2.RoomUpload(
             room=room,
             mode=enum_value(catalog_pb2.UploadMode, "UPLOAD_MODE_", mode, "mode"),
-            features=[requests.feature_source(source) for source, _ in upload.features],
+            feature_sources=[requests.feature_source(source) for source, _ in upload.features],
             encode_for=encode_for,
             format=format,
             license=license,
@@ -946,7 +1023,7 @@ class AsyncClient:
         room: str,
         *,
         base_adapter: str | None = None,
-        features: str | None = None,
+        feature_set: str | None = None,
         fitted_adapter: str | None = None,
         seed: int = 0,
         validate_only: bool = False,
@@ -959,7 +1036,7 @@ class AsyncClient:
         Args:
             room: The room.
             base_adapter: The pre-trained adapter of other rooms to start from; None to start from random weights.
-            features: The feature set; None if there is a base adapter or only one set.
+            feature_set: The feature set; None if there is a base adapter or only one set.
             fitted_adapter: The name of the adapter to publish; None for "ROOM.FEATURES.fitted".
             seed: The seed of the fit.
             validate_only: Whether everything is checked, and nothing is fitted or stored.
@@ -979,7 +1056,7 @@ class AsyncClient:
         request = catalog_pb2.FitAdapterRequest(
             room=room,
             base_adapter=base_adapter,
-            features=features,
+            feature_set=feature_set,
             fitted_adapter=fitted_adapter,
             seed=seed,
             request_id=request_id or requests.new_id(),
@@ -992,6 +1069,24 @@ class AsyncClient:
             if on_progress is not None:
                 on_progress(message.progress.done, message.progress.total)
         raise errors.SeeseError("the server ended a fit without a result")
+
+    async def defaults(self, *, deadline_s: float | None = None) -> list[CatalogDefault]:
+        """The defaults that were set for rooms and adapters.
+
+        Args:
+            deadline_s: Time limit of the call, seconds; None for that of the client.
+
+        Returns:
+            All current defaults.
+
+        Raises:
+            RefusedError: The server refused the request.
+
+        Example:
+            >>> [default.adapter for default in client.defaults() if default.room == "kitchen"]
+        """
+        answer = await self._ask(self._catalog.ListDefaults, catalog_pb2.ListDefaultsRequest(), deadline_s)
+        return [CatalogDefault.of(default) for default in answer.defaults]
 
     async def set_default(
         self,
@@ -1072,9 +1167,9 @@ class AsyncClient:
         if (adapter_of_room is not None) + (room is not None) + (adapter is not None) != 1:
             raise ValueError("give exactly one of adapter_of_room, room and adapter")
         request = catalog_pb2.ClearDefaultRequest(
-            room_adapter=adapter_of_room,
-            room_revision=room,
-            adapter_revision=adapter,
+            adapter_of_room=adapter_of_room,
+            revision_of_room=room,
+            revision_of_adapter=adapter,
             validate_only=validate_only,
             request_id=request_id or requests.new_id(),
         )
@@ -1400,7 +1495,7 @@ class AsyncTrack:
             self._is_busy = False
 
         # One refusal may stand for several frames, which newer ones took the place of.
-        answered = max(1, answer.refusal.frames) if answer.HasField("refusal") else 1
+        answered = max(1, answer.refusal.frame_count) if answer.HasField("refusal") else 1
         for _ in range(min(answered, len(self._awaited))):
             self._unsaved.append(self._awaited.popleft())
         self._note(answer)

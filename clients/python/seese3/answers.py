@@ -7,24 +7,28 @@ tables need the extras `seese3[plots]` and `seese3[pandas]`.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from . import errors
 from .errors import understood
-from .geometry import Array, covariance_matrix, pose_matrix, twist_vector
+from .geometry import Array, covariance_matrix, pose_matrix, twist_vector, vector
 from .v1 import catalog_pb2, evaluation_pb2, geometry_pb2, localization_pb2, navigation_pb2, odometry_pb2
 from .views import Feature, Latent, Revision
 from .words import DistortionModel, FinalNorm, LayerIndexBase, enum_word
 
 if TYPE_CHECKING:
     import pandas
+
+
+_Answer = TypeVar("_Answer")
 
 
 def _known(message: Any, field: str) -> Any:
@@ -166,20 +170,60 @@ class Camera:
         )
 
 
+@dataclass(frozen=True)
+class ExpectedError:
+    """The error to expect of views up to a distance from the map.
+
+    Attributes:
+        feature_distance: The largest distance of a view's feature from the nearest feature of the room, in standard
+            deviations of a feature column.
+        translation_m: The root mean square of the position error, meters.
+        rotation_rad: The root mean square of the rotation error, radians.
+    """
+
+    feature_distance: float
+    translation_m: float
+    rotation_rad: float
+
+
 @dataclass(frozen=True, eq=False)
 class Room:
-    """A room that is served. `adapters` fit its features, the default first."""
+    """A room that is served.
+
+    Attributes:
+        name: The name.
+        revision: The number of the revision, counted from 1.
+        frame_count: The number of frames.
+        adapters: The adapters that fit the features, the default first.
+        feature_sources: The sources of the features, one for each feature set.
+        format: The dataset format that the room was imported from.
+        license: The terms under which the recording may be used; empty if not stated.
+        worst_rotation_error: The largest entry of |RRᵀ − I| over the rotations as they were recorded.
+        created: When the revision was published.
+        camera: The camera of all images, in units of the image width; None if it is unknown.
+        extent: The smallest and the largest coordinates of the camera positions, (2, 3), meters; None if unknown.
+        duration_s: The duration of the recording, seconds; None without timestamps.
+        frame_rate_hz: The median frame rate, hertz; None without timestamps.
+        has_keypoints: Whether the room has keypoints, which are matched with those of images.
+        expected_errors: The errors of localization by the adapter that is fitted to the room, the nearest views
+            first, from cross-validation within the recording. Another recording is less accurate.
+    """
 
     name: str
     revision: int
     frame_count: int
     adapters: tuple[str, ...]
-    features: tuple[FeatureSource, ...]
+    feature_sources: tuple[FeatureSource, ...]
     format: str
     license: str
-    worst_rotation_deviation: float
+    worst_rotation_error: float
     created: datetime
     camera: Camera | None
+    extent: Array | None
+    duration_s: float | None
+    frame_rate_hz: float | None
+    has_keypoints: bool
+    expected_errors: tuple[ExpectedError, ...]
 
     @classmethod
     @understood
@@ -191,20 +235,38 @@ class Room:
             message.revision,
             message.frame_count,
             tuple(message.adapters),
-            tuple(map(FeatureSource.of, message.features)),
+            tuple(map(FeatureSource.of, message.feature_sources)),
             message.format,
             message.license,
-            message.worst_rotation_deviation,
+            message.worst_rotation_error,
             message.create_time.ToDatetime(timezone.utc),
             Camera.of(message.camera) if message.HasField("camera") else None,
+            np.array([vector(message.extent.min), vector(message.extent.max)]) if message.HasField("extent") else None,
+            _known(message, "duration_s"),
+            _known(message, "frame_rate_hz"),
+            message.has_keypoints,
+            tuple(
+                ExpectedError(one.feature_distance, one.translation_m, one.rotation_rad)
+                for one in message.expected_errors
+            ),
         )
 
 
 @dataclass(frozen=True)
 class MotionScores:
-    """R² of predicted motions over `n` pairs; None where the true motions do not vary, or nothing was held out."""
+    """R² of predicted motions; None where the true motions do not vary, or nothing was held out.
 
-    n: int
+    Attributes:
+        pair_count: The number of pairs scored.
+        overall: The mean R² of the six components of (v, ω).
+        translation: The mean R² of the three components of v.
+        rotation: The mean R² of the three components of ω.
+        direction: The mean R² of the three components of v/|v|, over pairs with |v| > 1 mm.
+        magnitude: R² of |v|.
+        still_components: The number of components that do not vary in the pairs; they have no R².
+    """
+
+    pair_count: int
     overall: float | None
     translation: float | None
     rotation: float | None
@@ -216,7 +278,7 @@ class MotionScores:
     @understood
     def of(cls, message: catalog_pb2.MotionScores) -> MotionScores:
         return cls(
-            n=message.n,
+            pair_count=message.pair_count,
             overall=_known(message, "overall"),
             translation=_known(message, "translation"),
             rotation=_known(message, "rotation"),
@@ -228,11 +290,36 @@ class MotionScores:
 
 @dataclass(frozen=True, eq=False)
 class Adapter:
-    """A trained adapter that is served, with how it was trained and its R²."""
+    """A trained adapter that is served.
+
+    Attributes:
+        name: The name.
+        revision: The number of the revision, counted from 1.
+        feature_source: The source of the features that it was trained on.
+        latent_dim: The number of columns of a latent.
+        charts: The number of charts.
+        training_rooms: The rooms that it was trained in.
+        calibration_rooms: The rooms in which its errors were measured.
+        preset: The preset that its training settings are based on.
+        split: How the test pairs were held out from training.
+        stride: The number of frames from the source to the target of a test pair.
+        loss: The training loss: "mse", "cosine" or "rotation".
+        mixing: How charts are mixed: "gate" or "even".
+        seed: The seed of the training run.
+        test: R² on the test pairs.
+        train: R² on the training pairs.
+        train_mean_r2: R² on the test pairs of a constant prediction, the mean of the training motions; None if the
+            test motions do not vary.
+        target_mean: The mean of the training motions, (6,).
+        target_deviation: Their population standard deviation per component, (6,).
+        singular_values: The singular values of W, the largest first.
+        navigators: The names that `navigate(navigator=…)` accepts.
+        created: When the revision was published.
+    """
 
     name: str
     revision: int
-    source: FeatureSource
+    feature_source: FeatureSource
     latent_dim: int
     charts: int
     training_rooms: tuple[Revision, ...]
@@ -260,7 +347,7 @@ class Adapter:
         return cls(
             name=message.name,
             revision=message.revision,
-            source=FeatureSource.of(message.source),
+            feature_source=FeatureSource.of(message.feature_source),
             latent_dim=message.latent_dim,
             charts=message.charts,
             training_rooms=tuple(map(Revision.of, message.training_rooms)),
@@ -324,6 +411,73 @@ class RoomFrames:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class DownloadedRoom:
+    """The frames and features of a room.
+
+    Attributes:
+        room: The room.
+        poses: The camera poses world_from_camera, (n, 4, 4).
+        features: The features by the name of their set, each (n, d).
+        sources: The sources of the features, by the same names.
+        timestamps_ns: The times of the frames, (n,), nanoseconds; None if unknown.
+        names: The recording's own names for the frames; None if it has none.
+        segments: The uninterrupted segment of each frame, (n,); None if there is only one.
+        camera: The camera of all images, in units of the image width; None if it is unknown.
+        format: The dataset format that the room was imported from.
+        license: The terms under which the recording may be used; empty if not stated.
+    """
+
+    room: Revision
+    poses: Array
+    features: dict[str, npt.NDArray[np.float32]]
+    sources: dict[str, FeatureSource]
+    timestamps_ns: npt.NDArray[np.int64] | None
+    names: tuple[str, ...] | None
+    segments: npt.NDArray[np.int64] | None
+    camera: Camera | None
+    format: str
+    license: str
+
+    @classmethod
+    @understood
+    def of(cls, messages: Sequence[catalog_pb2.DownloadRoomResponse]) -> DownloadedRoom:
+        if len(messages) < 2 or not messages[0].HasField("room") or not messages[-1].HasField("end"):
+            raise ValueError("it is not complete")
+        upload, end = messages[0].room.upload, messages[-1].end
+        batches = [message.frames for message in messages if message.HasField("frames")]
+        digest = hashlib.sha256()
+        for batch in batches:
+            for content in (batch.poses, *batch.features):
+                digest.update(content)
+        for message in messages:
+            digest.update(message.keypoints)
+        if digest.digest() != end.sha256:
+            raise ValueError("its checksum is wrong")
+
+        sources = [FeatureSource.of(source) for source in upload.feature_sources]
+        poses = np.frombuffer(b"".join(batch.poses for batch in batches), "<f8").reshape(-1, 4, 4)
+        rows = [b"".join(batch.features[number] for batch in batches) for number in range(len(sources))]
+        times = [time for batch in batches for time in batch.timestamps_ns]
+        names = tuple(name for batch in batches for name in batch.frame_names)
+        segments = [number for batch in batches for number in batch.segments]
+        return cls(
+            room=Revision.of(messages[0].room.revision),
+            poses=poses,
+            features={
+                source.name: np.frombuffer(values, "<f4").reshape(-1, source.dim)
+                for source, values in zip(sources, rows, strict=True)
+            },
+            sources={source.name: source for source in sources},
+            timestamps_ns=np.array(times, dtype=np.int64) if times else None,
+            names=names or None,
+            segments=np.array(segments, dtype=np.int64) if segments else None,
+            camera=Camera.of(upload.camera) if upload.HasField("camera") else None,
+            format=upload.format,
+            license=upload.license,
+        )
+
+
 @dataclass(frozen=True)
 class Publication:
     """What became of an upload: the revision, whether it is new, and whether it is served.
@@ -368,7 +522,7 @@ class ServerInfo:
         matches_keypoints: Whether it matches the keypoints of images.
         shows_thumbnails: Whether `frames` can return thumbnails.
         limits: The limits of requests, by name: "top_k", "steps", "batch", "predictions", "message_bytes",
-            "duration_s" and "image_pixels".
+            "duration_s", "image_pixels", "request_pixels", "answer_frames", "upload_bytes" and "streams".
     """
 
     version: str
@@ -487,7 +641,8 @@ class Localization:
     `pose` is None if the view is not in the map; `reason` then states why. `covariance` (6, 6) is in ROS order: x, y,
     z, and rotations about the axes of the world frame; None if the errors of the method were not measured. `novelty`
     above 1 means not in the map. `method` is "matched_keypoints", "fitted_adapter", "similar_frames", "nearest_frame"
-    or "recorded"; None without a pose. `frames` are the stored frames most similar to the view, the best first.
+    or "recorded"; None without a pose. `frames` are the stored frames most similar to the view, the best first;
+    `exact` is False if an approximate index found them.
     """
 
     pose: Array | None
@@ -501,6 +656,7 @@ class Localization:
     frames: tuple[SimilarFrame, ...]
     adapter: Revision | None
     room_count: int
+    exact: bool
 
     @classmethod
     @understood
@@ -520,6 +676,7 @@ class Localization:
             frames,
             Revision.of(message.adapter) if message.HasField("adapter") else None,
             message.room_count,
+            message.exact,
         )
 
 
@@ -620,7 +777,7 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Navigation:
-    """Where a motion leads, step by step. `displacement` is the whole motion (6,), each of `steps` a part of it."""
+    """Where a motion leads, step by step. `motion` is the whole motion (6,), each of `steps` a part of it."""
 
     room: Revision
     adapter: Revision
@@ -637,8 +794,8 @@ class Navigation:
         return tuple(map(Step.of, self._message.steps))
 
     @cached_property
-    def displacement(self) -> Array:
-        return twist_vector(self._message.displacement)
+    def motion(self) -> Array:
+        return twist_vector(self._message.motion)
 
     @cached_property
     def frame(self) -> Frame:
@@ -659,10 +816,13 @@ class Navigation:
         )
 
 
-def batch_of(message: navigation_pb2.BatchNavigateResponse) -> list[Navigation | errors.RefusedError]:
+def batch_of(
+    answer: type[_Answer],
+    message: navigation_pb2.BatchNavigateResponse | localization_pb2.BatchLocalizeResponse,
+) -> list[_Answer | errors.RefusedError]:
     """The answers of a batch in its order; a request that failed has its exception in its place."""
     return [
-        Navigation.of(result.response) if result.HasField("response") else errors.refused_part(result.error)
+        answer.of(result.response) if result.HasField("response") else errors.refused_part(result.error)  # type: ignore[attr-defined]
         for result in message.results
     ]
 
@@ -816,7 +976,7 @@ class Encoding:
         if not with_features:
             return cls(Revision.of(message.adapter), latents, None)
         features = tuple(
-            Feature(np.array(view.feature.values, dtype=np.float32), view.feature.source_name)
+            Feature(np.array(view.feature.values, dtype=np.float32), view.feature.feature_set)
             if view.HasField("feature")
             else None
             for view in message.views
@@ -830,16 +990,17 @@ class TrackStart:
 
     - `adapter`: None if the stream tracks by matched keypoints alone.
     - `room`: None if it is not known yet, and the camera has to be found.
-    - `keyframe_displacement`, `keyframe_frames`: a new keyframe is taken after a motion of this norm, meters and
-      radians mixed, and after the time of so many frames.
+    - `keyframe_motion_norm`: a new keyframe is taken after a motion of this norm, meters and radians mixed; None if
+      only the interval counts.
+    - `keyframe_interval`: the interval of keyframes in sequence numbers.
     - `calibration_rooms`: in how many rooms the covariances were calibrated.
     - `has_visual_odometry`: whether the motion between images is measured; not of features and latents.
     """
 
     adapter: Revision | None
     room: Revision | None
-    keyframe_displacement: float | None
-    keyframe_frames: int | None
+    keyframe_motion_norm: float | None
+    keyframe_interval: int | None
     calibration_rooms: int
     has_visual_odometry: bool
 
@@ -849,8 +1010,8 @@ class TrackStart:
         return cls(
             _revision(message, "adapter"),
             _revision(message, "room"),
-            _known(message.keyframes, "displacement"),
-            _known(message.keyframes, "frames"),
+            _known(message.keyframes, "motion_norm"),
+            _known(message.keyframes, "sequence_interval"),
             message.calibration_rooms,
             message.has_visual_odometry,
         )
@@ -1009,7 +1170,7 @@ class TrackUpdate:
                 Frame.of(match.frame) if match.HasField("frame") else None,
                 match.used,
                 _known(match, "mahalanobis_squared"),
-                match.camera or None,
+                match.camera_name or None,
             ),
             hypothesis=PoseHypothesis(
                 Revision.of(hypothesis.room),
@@ -1033,13 +1194,13 @@ class TrackRefusal:
     sequence_number: int
     reason: str
     message: str
-    frames: int
+    frame_count: int
 
     @classmethod
     @understood
     def of(cls, message: odometry_pb2.TrackRefusal) -> TrackRefusal:
         reason = enum_word(odometry_pb2.TrackRefusalReason, message.reason, "TRACK_REFUSAL_REASON_")
-        return cls(message.timestamp_ns, message.sequence_number, reason, message.message, message.frames)
+        return cls(message.timestamp_ns, message.sequence_number, reason, message.message, message.frame_count)
 
 
 @dataclass(frozen=True)
@@ -1062,13 +1223,18 @@ class Proportion:
         return cls(message.value, message.low, message.high)
 
 
+def _bounds(recall: evaluation_pb2.PoseRecall) -> tuple[float, float]:
+    """The bounds of a recall, meters and degrees. Degrees are rounded, so that they can be looked up."""
+    return recall.translation_m, round(float(np.degrees(recall.rotation_rad)), 9)
+
+
 @dataclass(frozen=True, eq=False)
 class NavigatorScores:
     """The scores of one navigator. Arrays have one entry for each threshold.
 
     Attributes:
         name: The name of the navigator.
-        n: The number of pairs scored.
+        pair_count: The number of pairs scored.
         latent_mse: The mean squared error of the predicted latents; None if only frames were predicted.
         latent_r2: The variance-weighted R² of the predicted latents, not of motions; None if only frames were
             predicted.
@@ -1084,7 +1250,7 @@ class NavigatorScores:
     """
 
     name: str
-    n: int
+    pair_count: int
     latent_mse: float | None
     latent_r2: float | None
     top1: Proportion
@@ -1103,7 +1269,7 @@ class NavigatorScores:
         hits = [Proportion.of(hit.proportion) for hit in message.hit_rates]
         return cls(
             message.name,
-            message.n,
+            message.pair_count,
             _known(message, "latent_mse"),
             _known(message, "latent_r2"),
             Proportion.of(message.top1),
@@ -1113,7 +1279,7 @@ class NavigatorScores:
             np.array([hit.high for hit in hits]),
             message.translation_m_median,
             message.rotation_rad_median,
-            {(one.translation_m, one.rotation_deg): Proportion.of(one.proportion) for one in message.recalls},
+            {_bounds(one): Proportion.of(one.proportion) for one in message.recalls},
             message.leaks,
         )
 
@@ -1152,16 +1318,17 @@ class SplitPairs:
     @classmethod
     @understood
     def of(cls, message: evaluation_pb2.ListPairsResponse) -> SplitPairs:
-        def pairs(sources: Sequence[int], targets: Sequence[int]) -> npt.NDArray[np.int64]:
-            return np.stack([np.array(sources, dtype=np.int64), np.array(targets, dtype=np.int64)], axis=1)
+        def pairs(given: Sequence[evaluation_pb2.FramePair]) -> npt.NDArray[np.int64]:
+            rows = [(pair.source_frame_id, pair.target_frame_id) for pair in given]
+            return np.array(rows, dtype=np.int64).reshape(-1, 2)
 
         return cls(
             Revision.of(message.room),
             enum_word(geometry_pb2.Split, message.split, "SPLIT_"),
             message.stride,
-            pairs(message.test_sources, message.test_targets),
-            pairs(message.training_sources, message.training_targets),
-            np.array(message.candidates, dtype=np.int64),
+            pairs(message.test_pairs),
+            pairs(message.training_pairs),
+            np.array(message.candidate_frame_ids, dtype=np.int64),
         )
 
 
@@ -1174,9 +1341,11 @@ class Evaluation:
         adapter: The adapter.
         split: The split; None for pairs of no split.
         stride: The number of frames from source to target; None if it is not the same for all pairs.
-        n: The number of pairs.
+        pair_count: The number of pairs.
         candidate_count: The number of frames that may be retrieved.
-        source_excluded: Whether the source frame of a pair could not be retrieved.
+        exclude_source: Whether the source frame of a pair could not be retrieved.
+        exclude_radius: The number of rows before and after the source frame that could not be retrieved either.
+        seed: The seed of the navigator "random"; None for `score`.
         in_room: Whether the adapter was trained in this room; None for `score`.
         leaks: Whether the adapter may have been trained on these pairs or their frames: the scores are then not
             held-out scores.
@@ -1191,9 +1360,11 @@ class Evaluation:
     adapter: Revision
     split: str | None
     stride: int | None
-    n: int
+    pair_count: int
     candidate_count: int
-    source_excluded: bool
+    exclude_source: bool
+    exclude_radius: int
+    seed: int | None
     in_room: bool | None
     leaks: bool
     calibrated_here: bool
@@ -1209,9 +1380,11 @@ class Evaluation:
             Revision.of(message.adapter),
             enum_word(geometry_pb2.Split, message.split, "SPLIT_"),
             message.stride,
-            message.n,
+            message.pair_count,
             message.candidate_count,
-            message.source_excluded,
+            message.exclude_source,
+            message.exclude_radius,
+            message.seed,
             message.in_room,
             message.leaks,
             message.calibrated_here,
@@ -1235,9 +1408,11 @@ class Evaluation:
             Revision.of(message.adapter),
             _word_or_none(geometry_pb2.Split, request.split, "SPLIT_"),
             strides.pop() if len(strides) == 1 else None,
-            scores.n,
+            scores.pair_count,
             message.candidate_count,
             request.exclude_source,
+            request.exclude_radius,
+            None,
             None,
             message.leaks,
             False,
@@ -1256,7 +1431,17 @@ class Evaluation:
         Raises:
             ValueError: the reports are of different pairs, or a name of a navigator is in both.
         """
-        for name in ("room", "adapter", "split", "stride", "n", "candidate_count", "source_excluded"):
+        same = (
+            "room",
+            "adapter",
+            "split",
+            "stride",
+            "pair_count",
+            "candidate_count",
+            "exclude_source",
+            "exclude_radius",
+        )
+        for name in same:
             ours, theirs = getattr(self, name), getattr(other, name)
             if ours != theirs:
                 raise ValueError(f"the reports are of different pairs: {name} is {ours} and {theirs}")
@@ -1272,9 +1457,9 @@ class Evaluation:
     def table(self) -> pandas.DataFrame:
         """The scores as a table, a row for each navigator. Needs the extra `seese3[pandas]`.
 
-        Columns are `n` pairs; `leak`, which is "LEAK" where the scores are not held-out scores, else ""; `latent_r2`,
-        the R² of predicted latents, not of motions; for each ε `hit@ε` with the ends of its 95 % interval; and
-        `median_m` and `median_deg`, the error of the retrieved frame.
+        Columns are `pairs`, their number; `leak`, which is "LEAK" where the scores are not held-out scores, else "";
+        `latent_r2`, the R² of predicted latents, not of motions; for each ε `hit@ε` with the ends of its 95 %
+        interval; and `median_m` and `median_deg`, the error of the retrieved frame.
 
         Raises:
             ImportError: pandas is not installed.
@@ -1286,7 +1471,7 @@ class Evaluation:
 
         rows = []
         for scores in self.navigators:
-            row: dict[str, Any] = {"navigator": scores.name, "n": scores.n}
+            row: dict[str, Any] = {"navigator": scores.name, "pairs": scores.pair_count}
             row |= {"leak": "LEAK" if scores.leaks else "", "latent_r2": scores.latent_r2}
             for epsilon, value, low, high in zip(
                 scores.thresholds, scores.hits, scores.hits_low, scores.hits_high, strict=True
@@ -1320,7 +1505,8 @@ class Evaluation:
             label = f"{scores.name} LEAK" if scores.leaks else scores.name
             axes.plot(scores.thresholds, scores.hits, dashes, color=color, marker=".", label=label)
             axes.fill_between(scores.thresholds, scores.hits_low, scores.hits_high, color=color, alpha=0.08)
-        motions = f"{self.n} motions" if self.stride is None else f"{self.n} motions over {self.stride} frames"
+        over = "" if self.stride is None else f" over {self.stride} frames"
+        motions = f"{self.pair_count} motions{over}"
         axes.set(
             xlabel="ε: meters and radians mixed",
             ylabel="Hit@ε",

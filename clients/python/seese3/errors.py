@@ -210,9 +210,6 @@ def _note(detail: Any, found: dict[str, Any]) -> None:
         found["reason"] = detail.reason
     elif isinstance(detail, error_details_pb2.BadRequest) and detail.field_violations:
         found["field"] = detail.field_violations[0].field
-    elif isinstance(detail, error_details_pb2.ResourceInfo):
-        # The server puts the field that names the missing thing here.
-        found.setdefault("field", detail.resource_type)
     elif isinstance(detail, error_details_pb2.RetryInfo):
         delay_s = detail.retry_delay.seconds + detail.retry_delay.nanos * 1e-9
         found["retry_after_s"] = min(max(delay_s, 0.0), LONGEST_RETRY_S)

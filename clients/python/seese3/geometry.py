@@ -85,6 +85,11 @@ def _quaternion_wxyz(rotation: Array) -> Array:
     return quaternion if quaternion[0] >= 0 else -quaternion
 
 
+def vector(coordinates: pb.Vector3) -> Array:
+    """The three coordinates, (3,)."""
+    return np.array([coordinates.x, coordinates.y, coordinates.z])
+
+
 def twist_vector(twist: pb.Twist) -> Array:
     """The (6,) vector of a twist from the wire."""
     v, omega = twist.linear, twist.angular

@@ -8,14 +8,14 @@ import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from .answers import Camera, FeatureSource
 from .geometry import real, wire_pose, wire_twist, wire_vector
-from .v1 import catalog_pb2, evaluation_pb2, geometry_pb2, navigation_pb2, odometry_pb2
+from .v1 import catalog_pb2, evaluation_pb2, geometry_pb2, localization_pb2, navigation_pb2, odometry_pb2
 from .views import Latent, View, png, wire_view
 from .words import Fusion, InverseVariant, StepMode, enum_value
 
@@ -78,28 +78,28 @@ def wire_view_camera(camera: Camera | str | None) -> geometry_pb2.ViewCamera | N
     if isinstance(camera, str):
         if camera != "mapping":
             raise ValueError(f'camera: must be a Camera or "mapping", got {camera!r}')
-        return geometry_pb2.ViewCamera(mapping_camera=True)
+        return geometry_pb2.ViewCamera(mapping_camera=geometry_pb2.MappingCamera())
     return geometry_pb2.ViewCamera(intrinsics=wire_camera(camera))
 
 
-def displacement(
+def requested_motion(
     to: int | None, twist: npt.ArrayLike | None, pose: npt.ArrayLike | None
-) -> navigation_pb2.Displacement:
+) -> navigation_pb2.RequestedMotion:
     """A motion by the frame at its end, as one twist (6,) or several (n, 6), or by the pose at its end."""
     if (to is not None) + (twist is not None) + (pose is not None) != 1:
         raise ValueError("give exactly one of to (a frame's row), twist and pose")
     if to is not None:
-        return navigation_pb2.Displacement(target_frame_id=count(to, "to"))
+        return navigation_pb2.RequestedMotion(target_frame_id=count(to, "to"))
     if pose is not None:
-        return navigation_pb2.Displacement(target_pose=wire_pose(pose))
+        return navigation_pb2.RequestedMotion(target_pose=wire_pose(pose))
 
     assert twist is not None
     twists = real(twist, "twist")
     if twists.ndim not in (1, 2):
         raise ValueError(f"twist: is (6,), or several (n, 6), not {twists.shape}")
     if twists.ndim == 1:
-        return navigation_pb2.Displacement(twist=wire_twist(twists))
-    return navigation_pb2.Displacement(twists=navigation_pb2.TwistList(twists=[wire_twist(row) for row in twists]))
+        return navigation_pb2.RequestedMotion(twist=wire_twist(twists))
+    return navigation_pb2.RequestedMotion(twists=navigation_pb2.TwistList(twists=[wire_twist(row) for row in twists]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ class NavigationQuery:
             adapter_revision=adapter_revision,
             source=wire_view(self.source),
             source_pose=None if self.source_pose is None else wire_pose(self.source_pose),
-            displacement=displacement(self.to, self.twist, self.pose),
+            motion=requested_motion(self.to, self.twist, self.pose),
             steps=count(self.steps, "steps"),
             step_mode=step_mode(self.step_mode),
             inverse_variant=enum_value(
@@ -143,50 +143,91 @@ class NavigationQuery:
 
 
 @dataclass(frozen=True, eq=False)
+class LocalizationQuery:
+    """One view to localize. See `Client.localize` for what the arguments mean."""
+
+    view: View
+    rooms: Sequence[str] | str = ()
+    room_revisions: Mapping[str, int] | None = None
+    adapter: str | None = None
+    adapter_revision: int | None = None
+    top_k: int | None = None
+    camera: Camera | Literal["mapping"] | None = None
+
+    def request(self) -> localization_pb2.LocalizeRequest:
+        return localization_pb2.LocalizeRequest(
+            rooms=names(self.rooms),
+            room_revisions=self.room_revisions,
+            adapter=self.adapter,
+            adapter_revision=self.adapter_revision,
+            view=wire_view(self.view),
+            top_k=count(self.top_k, "top_k"),
+            camera=wire_view_camera(self.camera),
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class InitialPose:
-    """A known pose (4, 4) of the camera in the map, or of the base if `frame` is its name, with its deviations."""
+    """A known pose of the camera or of the robot's base.
+
+    Attributes:
+        pose: The pose in the map, (4, 4).
+        position_deviation_m: The standard deviation of the position along each axis, meters; None for 0.1.
+        rotation_deviation_rad: The standard deviation of the rotation about each axis, radians; None for 0.1.
+        child_frame: The coordinate frame whose pose it is: the name of the camera (the default) or the base.
+    """
 
     pose: npt.ArrayLike
-    translation_deviation_m: float | None = None
+    position_deviation_m: float | None = None
     rotation_deviation_rad: float | None = None
-    frame: str = ""
+    child_frame: str = ""
 
     def message(self) -> odometry_pb2.InitialPose:
         return odometry_pb2.InitialPose(
-            pose=wire_pose(self.pose, child_frame=self.frame),
-            translation_deviation_m=self.translation_deviation_m,
+            pose=wire_pose(self.pose, child_frame=self.child_frame),
+            position_deviation_m=self.position_deviation_m,
             rotation_deviation_rad=self.rotation_deviation_rad,
         )
 
 
 @dataclass(frozen=True, eq=False)
 class RigCamera:
-    """Another camera on the robot: its name, its pose (4, 4) on the base, and its intrinsics if they are known.
+    """Another camera on the robot.
 
-    `time_offset_ns` is the time from the middle of the exposure of the stream's own view to that of this camera's view.
+    Attributes:
+        name: Its name, which `other_views` of a step use.
+        pose: Its pose (4, 4) in the frame of the base or, without `base_from_camera`, of the stream's own camera.
+        intrinsics: Its intrinsics, if they are known.
+        time_offset_ns: The time from the middle of the exposure of the stream's own view to that of this camera's
+            view, nanoseconds.
     """
 
     name: str
     pose: npt.ArrayLike
-    camera: Camera | None = None
+    intrinsics: Camera | None = None
     time_offset_ns: int = 0
 
 
 @dataclass(frozen=True, eq=False)
 class InertialSensor:
-    """A gyroscope and an accelerometer, by their pose (4, 4) on the base or, where that is not known, from the camera.
+    """A gyroscope and an accelerometer on the robot. Noise applies to each axis; None selects the server's default.
 
-    - `gyroscope_noise`, `accelerometer_noise`: white noise, rad/s/√Hz and m/s²/√Hz.
-    - `gyroscope_bias`, `accelerometer_bias`: standard deviations of the biases at the beginning, rad/s and m/s².
-    - `gyroscope_bias_walk`, `accelerometer_bias_walk`: random walks of the biases, rad/s²/√Hz and m/s³/√Hz.
-    - `time_offset_ns`: is added to the times of the samples to get those of the images.
+    Attributes:
+        pose: The pose (4, 4) of their axes in the frame of the base or, without `base_from_camera`, of the camera.
+        gyroscope_noise: White noise of the gyroscope, rad/s/√Hz.
+        accelerometer_noise: White noise of the accelerometer, m/s²/√Hz.
+        gyroscope_bias_deviation: Standard deviation of the gyroscope's bias at the beginning, rad/s.
+        accelerometer_bias_deviation: Standard deviation of the accelerometer's bias at the beginning, m/s².
+        gyroscope_bias_walk: Random walk of the gyroscope's bias, rad/s²/√Hz.
+        accelerometer_bias_walk: Random walk of the accelerometer's bias, m/s³/√Hz.
+        time_offset_ns: Is added to the timestamps of the samples to get those of the images, nanoseconds.
     """
 
     pose: npt.ArrayLike | None = None
     gyroscope_noise: float | None = None
     accelerometer_noise: float | None = None
-    gyroscope_bias: float | None = None
-    accelerometer_bias: float | None = None
+    gyroscope_bias_deviation: float | None = None
+    accelerometer_bias_deviation: float | None = None
     gyroscope_bias_walk: float | None = None
     accelerometer_bias_walk: float | None = None
     time_offset_ns: int = 0
@@ -225,7 +266,33 @@ class InertialSamples:
 
 @dataclass(frozen=True, eq=False)
 class TrackConfig:
-    """What a tracking stream is to do. What is left out is chosen by the server."""
+    """The configuration of a tracking stream. None selects the server's default.
+
+    Attributes:
+        room: The room; None to find it from the first frames, among `rooms`.
+        rooms: The rooms that the camera may be in; () for all. Refused together with `room`.
+        room_revisions: The revisions of rooms that are not the current ones, by name of the room.
+        adapter: The adapter; None for the default of the rooms. Images of rooms with keypoints need none.
+        adapter_revision: The revision of `adapter`; None for the current one.
+        initial_pose: The pose at the first frame; None to find it from the first frames. Needs `room`.
+        keyframe_motion_norm: A new keyframe is taken after a motion of at least this norm, meters and radians mixed.
+        keyframe_interval: The interval of keyframes in sequence numbers; None for 30.
+        fusion: "anchors" (the default): located views correct the drift; "none": pure dead reckoning, which needs an
+            initial pose.
+        newest_only: Whether frames that arrive faster than they can be answered are dropped for newer ones.
+        token_every: Every n-th answer carries the token with which a cut stream resumes, at least 1.
+        base_from_camera: The pose of the camera in the frame of the robot's base, (4, 4). With it, answers also have
+            the poses of the base.
+        camera: The camera, or "mapping" for the one that mapped the rooms. In a room with keypoints, the focal length
+            of an unknown camera is estimated from the first images.
+        gravity_in_map: The direction of gravity in the room's world frame, (3,) of any length. Needs `room`.
+        other_cameras: Other cameras on the robot, at most 8.
+        inertial_sensor: A gyroscope and an accelerometer on the robot.
+        trust_odometry: Whether the odometry of the steps is used where images or the gyroscope contradict it, and
+            carries the pose where no view is located.
+        time_offset_ns: The time from a frame's timestamp to the start of its exposure, nanoseconds. Only the
+            integration of inertial samples uses it.
+    """
 
     room: str | None = None
     rooms: Sequence[str] | str = ()
@@ -233,44 +300,36 @@ class TrackConfig:
     adapter: str | None = None
     adapter_revision: int | None = None
     initial_pose: InitialPose | None = None
-    keyframe_displacement: float | None = None
-    keyframe_frames: int | None = None
+    keyframe_motion_norm: float | None = None
+    keyframe_interval: int | None = None
     fusion: Fusion | None = None
-    """"anchors" (the default): located views correct the pose; or "none"."""
     newest_only: bool = False
-    """Whether frames that arrive faster than they can be answered are dropped for newer ones."""
     token_every: int = 1
-    """Which answers bring the token by which a cut stream resumes: every n-th."""
     base_from_camera: npt.ArrayLike | None = None
-    camera: Camera | str | None = None
-    """The camera, or "mapping" for the one that mapped the rooms. In a room with keypoints, the focal length of an
-    unknown camera is estimated from the first images."""
+    camera: Camera | Literal["mapping"] | None = None
     gravity_in_map: npt.ArrayLike | None = None
     other_cameras: Sequence[RigCamera] = ()
     inertial_sensor: InertialSensor | None = None
     trust_odometry: bool = False
-    """Whether the odometry of the steps is used where images or the gyroscope contradict it, and carries the pose."""
     time_offset_ns: int = 0
-    """Time from a frame's timestamp to the start of its exposure, besides that of the inertial sensor."""
 
     def message(self) -> odometry_pb2.TrackConfig:
         if self.token_every < 1:
             raise ValueError("token_every: a stream that can resume needs a token now and then; give 1 or more")
         keyframes = None
-        if self.keyframe_displacement is not None or self.keyframe_frames is not None:
+        if self.keyframe_motion_norm is not None or self.keyframe_interval is not None:
             keyframes = odometry_pb2.KeyframePolicy(
-                displacement=self.keyframe_displacement, frames=self.keyframe_frames
+                motion_norm=self.keyframe_motion_norm, sequence_interval=self.keyframe_interval
             )
         others = [
             odometry_pb2.RigCamera(
                 name=other.name,
                 pose=wire_pose(other.pose),
-                camera=wire_camera(other.camera),
+                intrinsics=wire_camera(other.intrinsics),
                 time_offset_ns=other.time_offset_ns,
             )
             for other in self.other_cameras
         ]
-        camera = wire_view_camera(self.camera)
         pressure = odometry_pb2.BACK_PRESSURE_NEWEST if self.newest_only else odometry_pb2.BACK_PRESSURE_UNSPECIFIED
         return odometry_pb2.TrackConfig(
             room=self.room,
@@ -284,8 +343,7 @@ class TrackConfig:
             back_pressure=pressure,
             token_every=self.token_every,
             base_from_camera=None if self.base_from_camera is None else wire_pose(self.base_from_camera),
-            camera=camera.intrinsics if camera is not None and camera.HasField("intrinsics") else None,
-            mapping_camera=camera is not None and camera.mapping_camera,
+            camera=wire_view_camera(self.camera),
             gravity_in_map=None if self.gravity_in_map is None else wire_vector(self.gravity_in_map),
             other_cameras=others,
             inertial_sensor=self.inertial_sensor.message() if self.inertial_sensor else None,
@@ -296,10 +354,18 @@ class TrackConfig:
 
 @dataclass(frozen=True, eq=False)
 class Odometry:
-    """The pose (4, 4) of the wheels' or another odometry at a frame, and how far it drifts, as shares of the motion.
+    """The odometry of another sensor at a frame, for instance of wheels.
 
-    `velocity_covariance` (6, 6), on (v, ω) in the body frame, is that of the independent error of the velocity since
-    the last frame, like `twist.covariance` of ROS.
+    Attributes:
+        pose: The pose in the sensor's own odometry frame, (4, 4). It may drift and must not jump.
+        child_frame: The coordinate frame whose pose it is: the name of the camera or the base. Empty for the base
+            with `base_from_camera`, else the camera.
+        translation_share: The standard deviation of a translation along each axis, meters per meter traveled; None
+            for 0.05.
+        rotation_share: The standard deviation of a rotation about each axis, radians per radian of rotation and per
+            meter traveled; None for 0.05.
+        velocity_covariance: The covariance (6, 6) of the independent error of the velocity since the last frame, on
+            (v, ω) in the body frame, m²/s² and rad²/s², as `twist.covariance` of ROS.
     """
 
     pose: npt.ArrayLike
@@ -311,10 +377,17 @@ class Odometry:
 
 @dataclass(frozen=True, eq=False)
 class Gravity:
-    """The direction of gravity (3,) in the frame of the camera, or of the base if `frame` is its name."""
+    """The direction of gravity measured on the robot.
+
+    Attributes:
+        direction: The direction (3,), of any length; at rest it is opposite to the measured acceleration.
+        coordinate_frame: The coordinate frame of the direction: the name of the camera or the base. Empty for the
+            base with `base_from_camera`, else the camera.
+        deviation_rad: The standard deviation about each axis, radians; None for 0.03.
+    """
 
     direction: npt.ArrayLike
-    frame: str = ""
+    coordinate_frame: str = ""
     deviation_rad: float | None = None
 
 
@@ -366,9 +439,11 @@ def track_frame(
     down = None
     if gravity is not None:
         down = odometry_pb2.MeasuredGravity(
-            direction=wire_vector(gravity.direction), frame=gravity.frame, deviation_rad=gravity.deviation_rad
+            direction=wire_vector(gravity.direction),
+            coordinate_frame=gravity.coordinate_frame,
+            deviation_rad=gravity.deviation_rad,
         )
-    others = [odometry_pb2.OtherView(camera=name, view=wire_view(other)) for name, other in other_views.items()]
+    others = [odometry_pb2.OtherView(camera_name=name, view=wire_view(other)) for name, other in other_views.items()]
     return odometry_pb2.TrackRequest(
         frame=odometry_pb2.TrackFrame(
             timestamp_ns=timestamp_ns,

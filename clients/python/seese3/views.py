@@ -4,7 +4,7 @@ A view is one of these:
 
 - an `int`: the row of a stored frame of the room;
 - a NumPy array (d,) of floating-point numbers: a feature of the encoder that the adapter was trained on;
-- a `Feature`: the same, with the name of its source, which the server then checks;
+- a `Feature`: the same, with the name of its feature set, which the server then checks;
 - a `Latent`: an adapter's latent, from `encode` or an earlier answer;
 - an image: `bytes`, the content of a JPEG or PNG file; `str` or `os.PathLike`, its path; or a NumPy array of bytes
   (uint8), (h, w, 3) in the order red, green, blue, or (h, w) gray.
@@ -28,10 +28,15 @@ from .v1 import geometry_pb2 as pb
 
 @dataclass(frozen=True)
 class Feature:
-    """A feature (d,), and the name of the set of features that it belongs to."""
+    """A feature: one row of encoder output.
+
+    Attributes:
+        values: The numbers, (d,).
+        feature_set: The name of the feature set that it belongs to, which the server then checks; empty for no check.
+    """
 
     values: npt.NDArray[np.floating]
-    source_name: str = ""
+    feature_set: str = ""
 
 
 @dataclass(frozen=True)
@@ -87,7 +92,7 @@ def wire_view(view: View) -> pb.View:
     if isinstance(view, Latent):
         return pb.View(latent=view.message())
     if isinstance(view, Feature):
-        return _packed_feature(view.values, view.source_name)
+        return _packed_feature(view.values, view.feature_set)
     if isinstance(view, np.ndarray) and view.dtype == np.uint8 and view.ndim in (2, 3):
         return pb.View(image=png(view))
     if isinstance(view, np.ndarray):
@@ -107,12 +112,12 @@ def _row(values: npt.ArrayLike, what: str) -> npt.NDArray[np.floating]:
     return row
 
 
-def _packed_feature(values: npt.ArrayLike, source_name: str) -> pb.View:
+def _packed_feature(values: npt.ArrayLike, feature_set: str) -> pb.View:
     """A feature by its bytes: a list of numbers through protobuf costs twenty times as much."""
     numbers = _row(values, "a feature").astype("<f4").tobytes()
     feature = b"\x0a" + _varint(len(numbers)) + numbers
-    if source_name:
-        name = source_name.encode()
+    if feature_set:
+        name = feature_set.encode()
         feature += b"\x12" + _varint(len(name)) + name
     view: pb.View = pb.View.FromString(b"\x12" + _varint(len(feature)) + feature)
     return view

@@ -67,14 +67,14 @@ def test_navigation(client: seese3.Client) -> None:
     assert answer.steps[-1].error is not None and answer.steps[-1].error.twist_norm > 0
 
     # The same motion as a twist leads to the same frame.
-    assert client.navigate(ROOM, 20, twist=answer.displacement, steps=2, step_mode="snap").frame.id == answer.frame.id
+    assert client.navigate(ROOM, 20, twist=answer.motion, steps=2, step_mode="snap").frame.id == answer.frame.id
 
     queries = [NavigationQuery(20, to=30, steps=2, step_mode="snap"), NavigationQuery(20, to=9999)]
     batch = client.navigate_batch(ROOM, queries)
     assert isinstance(batch[0], seese3.Navigation) and batch[0].frame.id == answer.frame.id
     assert isinstance(batch[1], seese3.NotFoundError)
     # The error of a query has what the query alone would get.
-    assert (batch[1].reason, batch[1].field) == ("NOT_SERVED", "displacement.target_frame_id")
+    assert (batch[1].reason, batch[1].field) == ("NOT_SERVED", "motion.target_frame_id")
 
     route = client.plan_route(ROOM, 5, goal=60)
     assert route.outcome == "found" and len(route.hops) > 1
@@ -114,6 +114,15 @@ def test_localization_of_features_and_images(client: seese3.Client, drawn: Path)
     assert strange.pose is None and strange.method is None and len(strange.frames) == 1
     assert strange.novelty is not None and strange.novelty > 1
     assert strange.reason is not None and "not in the map" in strange.reason
+
+    # A batch has the answers of its queries alone, and the exceptions of those that fail.
+    queries = [seese3.LocalizationQuery(room.features[FEATURES][33], ROOM), seese3.LocalizationQuery(1, "nowhere")]
+    batch = client.localize_batch(queries)
+    assert isinstance(batch[0], seese3.Localization) and batch[0].pose is not None and batch[0].exact
+    np.testing.assert_array_equal(batch[0].pose, client.localize(views[0], rooms=ROOM).pose)
+    assert isinstance(batch[1], seese3.NotFoundError) and batch[1].field == "rooms[0]"
+    with pytest.raises(ValueError, match=r"queries\[0\]: top_k"):
+        client.localize_batch([seese3.LocalizationQuery(1, ROOM, top_k=-1)])
 
     stored = client.localize(33, rooms=ROOM)
     assert stored.method == "recorded" and stored.pose is not None
@@ -182,7 +191,7 @@ def test_evaluation_and_predictions_of_ones_own(client: seese3.Client, drawn: Pa
     np.testing.assert_array_equal(both.navigators[-1].hits, scores["identity"].hits)
     # Frames do not depend on the adapter, and its latents have seen the pairs.
     assert both.table().loc["stay", "leak"] == ""
-    with pytest.raises(ValueError, match="different pairs: n"):
+    with pytest.raises(ValueError, match="different pairs: pair_count"):
         report.with_navigator(client.score(ROOM, [seese3.Prediction(0, 10, frame=0)], adapter="robot", split="whole"))
     with pytest.raises(ValueError, match="'stay' is in both"):
         both.with_navigator(mine)
@@ -265,7 +274,18 @@ def test_changes_of_the_catalog(store: Path) -> None:
         assert client.upload_room("copy", more, mode="extend").revision.revision == 2
         np.testing.assert_array_equal(seese3.Store(store).room("copy").features[FEATURES], rows)
 
-        manifest, weights = seese3.Store(store).adapter_files("robot")
+        # What is downloaded is what was uploaded.
+        copy = client.download_room("copy")
+        assert (copy.room.name, copy.room.revision) == ("copy", 2)
+        np.testing.assert_array_equal(copy.features[FEATURES], rows)
+        np.testing.assert_allclose(copy.poses, room.poses, atol=1e-12)
+        assert len(client.download_room("copy", revision=1).poses) == 80
+        described = client.room("copy")
+        assert described.extent is not None and described.duration_s is None
+        np.testing.assert_allclose(described.extent[0], room.poses[:, :3, 3].min(axis=0), atol=1e-12)
+
+        manifest, weights = client.download_adapter("robot")
+        assert (manifest, weights) == seese3.Store(store).adapter_files("robot")
         assert client.upload_adapter("again", manifest, weights).served
         assert "again" in [adapter.name for adapter in client.adapters()]
 
@@ -274,11 +294,12 @@ def test_changes_of_the_catalog(store: Path) -> None:
         assert client.clear_default(adapter_of_room=ROOM) == []
 
         done: list[int] = []
-        fitted = client.fit_adapter("copy", features=FEATURES, on_progress=lambda n, _: done.append(n))
+        fitted = client.fit_adapter("copy", feature_set=FEATURES, on_progress=lambda n, _: done.append(n))
         assert fitted.created and done
         defaults = client.set_default(room="copy", adapter="again")
         assert defaults == [seese3.CatalogDefault(room="copy", adapter="again")]
         assert seese3.CatalogDefault(adapter="again", revision=1) in client.set_default(adapter="again", revision=1)
+        assert seese3.CatalogDefault(adapter="again", revision=1) in client.defaults()
         client.clear_default(adapter="again")
         assert client.room("copy").adapters[0] == "again"
         assert client.set_default(room="copy", revision=1) and client.room("copy").frame_count == 80

@@ -46,7 +46,7 @@ def test_what_is_no_pose_is_refused(pose: np.ndarray) -> None:
 @pytest.mark.parametrize("columns", [1, 31, 32, 768, 5000])
 def test_a_feature_packed_by_its_bytes_is_the_message_that_protobuf_makes(columns: int) -> None:
     row = np.random.default_rng(columns).normal(size=columns).astype(np.float32)
-    expected = pb.View(feature=pb.Feature(values=row.tolist(), source_name="größe"))
+    expected = pb.View(feature=pb.Feature(values=row.tolist(), feature_set="größe"))
     assert wire_view(Feature(row, "größe")) == expected
     assert wire_view(row.astype(np.float64)).feature.values == expected.feature.values
 

@@ -225,30 +225,50 @@ def test_unfit_rooms_are_refused_and_leave_nothing(tmp_path: Path) -> None:
     turned = good.transpose(0, 2, 1)
     broken = good.copy()
     broken[2, 0, 3] = np.nan
+    far = good.copy()
+    far[:, 0, 3] += 2e6
     for wrong, features, problem in (
         (good[:, :3], {"a": rows}, "poses: are"),
-        (turned, {"a": rows}, "transposed"),
-        (broken, {"a": rows}, "row 2"),
         (good, {"a": rows[:3]}, "features: 'a' is"),
-        (good, {"a": rows * np.nan}, "row 0"),
         (good, {"../a": rows}, "cannot be the name"),
         (good, {"a": rows, seese3.FeatureSource("a", 3): rows}, "same name"),
-        (good + 2e6 * np.eye(4)[:, [1, 2, 3, 0]], {"a": rows}, "from the origin"),
     ):
         with pytest.raises(ValueError, match=problem):
             store.write_room("hall", wrong, features)
+    # The program refuses what an array of the right shape says.
+    for wrong, features, problem in (
+        (turned, {"a": rows}, "poses.npy"),
+        (broken, {"a": rows}, "frame 2"),
+        (good, {"a": rows * np.nan}, "finite"),
+        (far, {"a": rows}, "from the origin"),
+    ):
+        with pytest.raises(seese3.CommandError, match=problem):
+            store.write_room("hall", wrong, features)
     for columns, problem in (
         ({"timestamps_ns": np.full(4, 2**63, np.uint64)}, "timestamps_ns"),
-        ({"sequences": [-1] * 4}, "sequences"),
         ({"names": ["a", "b", "c", 4]}, "names: row 3"),
         ({"names": "abcd"}, "names: is a list"),
-        ({"licence": float("nan")}, "licence"),
     ):
         with pytest.raises(ValueError, match=problem):
             store.write_room("hall", good, {"a": rows}, **columns)
+    with pytest.raises(seese3.CommandError, match="invalid value"):
+        store.write_room("hall", good, {"a": rows}, segments=[-1] * 4)
     with pytest.raises(ValueError, match="cannot be the name"):
         store.write_room("../hall", good, {"a": rows})
     assert not store.folder.exists()
+
+
+def test_a_room_is_replaced_or_extended_only_if_asked(tmp_path: Path) -> None:
+    store, first, rows = seese3.Store(tmp_path), poses(4), np.ones((4, 2))
+    store.write_room("hall", first, {"a": rows})
+    with pytest.raises(seese3.CommandError, match="other frames"):
+        store.write_room("hall", poses(4), {"a": rows})
+    assert store.write_room("hall", poses(4), {"a": rows}, mode="extend").revision == 2
+    room = store.room("hall")
+    assert len(room) == 8 and list(room.segments) == [0] * 4 + [1] * 4
+    np.testing.assert_allclose(room.poses[:4], first, atol=1e-12)
+    assert store.write_room("hall", poses(3), {"a": rows[:3]}, mode="replace").revision == 3
+    assert len(store.room("hall")) == 3
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 0, 2)])
@@ -275,9 +295,9 @@ def test_writers_at_once_lose_nothing_of_each_other(tmp_path: Path) -> None:
     seese3.run("store", "verify", "--store", store.folder)
 
 
-def test_a_licence_is_kept_by_those_who_add_features(tmp_path: Path) -> None:
+def test_a_license_is_kept_by_those_who_add_features(tmp_path: Path) -> None:
     store, stated = seese3.Store(tmp_path), poses(3)
-    store.write_room("hall", stated, {"a": np.ones((3, 2))}, licence="CC BY 4.0", format="mine")
+    store.write_room("hall", stated, {"a": np.ones((3, 2))}, license="CC BY 4.0", format="mine")
     store.write_room("hall", stated, {"b": np.ones((3, 2))})
     provenance = store.room("hall").manifest["provenance"]
     assert (provenance["licence"], provenance["format"]) == ("CC BY 4.0", "mine")
@@ -298,19 +318,20 @@ def test_unfit_adapters_are_refused_and_leave_nothing(tmp_path: Path) -> None:
         "target_deviation": np.ones(6),
     }
     for weights, changes, problem in (
-        (good, {"split": "block"}, "split"),
+        (good, {"split": "block"}, "unknown variant"),
         (good, {"stride": 0}, "stride"),
-        (good, {"stride": 1.5}, "stride"),
-        (good, {"seed": -1}, "seed"),
-        (good, {"rooms": {"hall": "x"}}, "rooms"),
+        (good, {"seed": -1}, "invalid value"),
+        (good, {"rooms": {"../hall": 1}}, "adapter.json"),
         (good, {"target_deviation": np.full(6, np.inf)}, "finite"),
         ({**good, "W.weight": np.zeros((6, 7))}, {}, "rank"),
         ({**good, "W.weight": np.full((6, 7), np.nan)}, {}, "finite"),
-        ({**good, "phi.0.weight": np.ones(8)}, {}, "phi.0.weight"),
-        ({**good, "foo": np.ones(3)}, {}, "foo"),
+        ({**good, "phi.0.weight": np.ones(8)}, {}, "phi.0"),
+        ({key: value for key, value in good.items() if key != "W.weight"}, {}, "W.weight"),
     ):
-        with pytest.raises(ValueError, match=problem):
+        with pytest.raises(seese3.CommandError, match=problem):
             store.write_adapter("mine", weights, **{**told, **changes})
+    with pytest.raises(ValueError, match="foo"):
+        store.write_adapter("mine", {**good, "foo": np.ones(3)}, **told)
     assert not store.folder.exists()
 
 
@@ -345,7 +366,8 @@ def test_of_many_writers_each_gets_a_number_of_its_own(tmp_path: Path) -> None:
     store = seese3.Store(tmp_path)
     rooms = [poses(3) for _ in range(12)]
     with ThreadPoolExecutor(6) as pool:
-        revisions = list(pool.map(lambda one: store.write_room("hall", one, {"a": np.ones((3, 2))}).revision, rooms))
+        written = pool.map(lambda one: store.write_room("hall", one, {"a": np.ones((3, 2))}, mode="replace"), rooms)
+        revisions = [revision.revision for revision in written]
     assert sorted(revisions) == list(range(1, 13))
     seese3.run("store", "verify", "--store", store.folder)
 
@@ -353,7 +375,7 @@ def test_of_many_writers_each_gets_a_number_of_its_own(tmp_path: Path) -> None:
 def test_a_chosen_revision_is_what_the_name_means(tmp_path: Path) -> None:
     store = seese3.Store(tmp_path)
     for _ in range(2):
-        store.write_room("hall", poses(3), {"a": np.ones((3, 2))})
+        store.write_room("hall", poses(3), {"a": np.ones((3, 2))}, mode="replace")
     seese3.run("store", "default", "--store", tmp_path, "rooms/hall/revisions/1")
     assert store.room("hall").revision.revision == 1
     assert json.loads((tmp_path / "rooms/hall/revisions/000002.json").read_text())["body"]["revision"] == 2

@@ -37,8 +37,8 @@ def is_near(found: list[seese3.TrackUpdate], expected: list[seese3.TrackUpdate])
 def test_a_camera_is_followed(client: seese3.Client, drawn: Path) -> None:
     room = seese3.Store(drawn).room(ROOM)
     # The room was recorded in two visits, and a camera cannot jump from one to the other.
-    assert room.sequences is not None
-    first_visit = int((room.sequences == 0).sum())
+    assert room.segments is not None
+    first_visit = int((room.segments == 0).sum())
     config = seese3.TrackConfig(room=ROOM, initial_pose=seese3.InitialPose(room.poses[0]))
     with client.track(config) as track:
         updates = followed(track, room.features[FEATURES][:first_visit])
@@ -140,7 +140,7 @@ def test_newer_frames_that_take_the_place_of_older_ones_are_counted(client: sees
         answers = list(track.follow(iter(frames), ahead=64))
         assert track.start is not None and track.start.adapter is not None
         assert track.start.adapter.name == "robot"
-    refused = sum(one.frames for one in answers if isinstance(one, seese3.TrackRefusal))
+    refused = sum(one.frame_count for one in answers if isinstance(one, seese3.TrackRefusal))
     assert refused + sum(isinstance(one, seese3.TrackUpdate) for one in answers) == len(frames)
     assert answers[-1].sequence_number == len(frames)
 
@@ -180,7 +180,7 @@ def test_what_a_stream_refuses(client: seese3.Client) -> None:
         assert isinstance(refused, seese3.TrackRefusal) and refused.reason == "view"
         track.reset()
         with pytest.raises(seese3.InvalidFieldError):
-            track.set_initial_pose(seese3.InitialPose(np.eye(4), translation_deviation_m=-1.0))
+            track.set_initial_pose(seese3.InitialPose(np.eye(4), position_deviation_m=-1.0))
 
 
 def test_a_camera_is_followed_with_an_inertial_sensor(client: seese3.Client, drawn: Path) -> None:

@@ -1,4 +1,8 @@
-"""The node: subscriptions, publishers, and the thread that follows the server's answers."""
+"""The node: subscriptions, publishers, services, and the thread that takes the server's answers.
+
+It is a lifecycle node. Configured, it has its topics and a connection; active, it has a stream. With `autostart`, which is
+the default, it becomes active by itself.
+"""
 
 import collections
 import functools
@@ -11,11 +15,13 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
+from std_srvs.srv import Trigger
 from tf2_ros import TransformBroadcaster
 
 from . import answers, connection, requests
@@ -24,7 +30,7 @@ from .v1 import odometry_pb2
 
 LEVELS = {"TRACKING": 0, "DEGRADED": 1, "RELOCALIZING": 1, "LOST": 2}
 # What another sensor said so long ago says nothing of a frame, nanoseconds.
-OLD_NS = 50_000_000
+OLD_NS = requests.OLD_NS
 # Images of several cameras belong together when they were taken within this time, nanoseconds.
 TOGETHER_NS = 20_000_000
 # What TF is published: odom -> base and map -> odom of the server; only map -> odom of the robot's own odometry, as AMCL
@@ -32,22 +38,26 @@ TOGETHER_NS = 20_000_000
 TF = ("odom_and_map", "map_only", "none")
 # Frames whose odometry is kept until their answers come.
 MOST_DRIVEN = 100
-PARAMETERS = {"server": "127.0.0.1:50051", "room": "", "adapter": "", "camera_frame": "camera_optical_frame",
+# What may be set while the node is configured: the stream is opened again.
+CHANGEABLE = ("room", "adapter")
+PARAMETERS = {"autostart": True, "server": "127.0.0.1:50051", "room": "", "adapter": "", "camera_frame": "camera_optical_frame",
               "odom_frame": "odom", "map_frame": "map", "base_frame": "base_link", "tf": "odom_and_map", "tls_ca": "", "tls_cert": "", "tls_key": "",
               "token_file": "", "use_camera_info": False, "wheel_drift": 0.05,
               "use_wheel_covariance": False, "trust_odometry": False, "inertial": False, "depth": False,
               "depth_deviation": 0.005}
 
 
-class Bridge(Node):
+class Bridge(LifecycleNode):
     def __init__(self):
         super().__init__("seese3")
         self.given = {name: self.declare_parameter(name, plain).value for name, plain in PARAMETERS.items()}
         self.config = self.configuration()
+        self.is_active, self.thread, self.channel, self.listened = False, None, None, []
         self.counts = {"images": 0, "updates": 0, "refusals": 0, "images not sent": 0, "requests dropped": 0, "images overtaken": 0,
                        "odometry begun anew": 0}
-        # The last of each sensor, with its stamp.
-        self.wheels = self.gravity = None
+        self.wheels = requests.Wheels()
+        # The last direction of gravity, with its stamp.
+        self.gravity = None
         self.beside, self.gravity_of = {}, requests.Gravity()
         self.depth = None
         # Samples of the inertial sensor since the last frame.
@@ -58,21 +68,98 @@ class Bridge(Node):
         if not self.given["use_camera_info"]:
             self.begins.set()
 
+        if self.given["tf"] not in TF:
+            raise ValueError(f"tf is {self.given['tf']!r}, and none of: {', '.join(TF)}")
+        if self.given["tf"] == "map_only" and not self.has_base:
+            raise ValueError("tf: map_only needs base_from_camera, and ~/wheels as the robot's odometry")
+        # The robot's own odometry of the frames that have no answer yet, by their stamps.
+        self.driven = collections.OrderedDict()
+        self.add_on_set_parameters_callback(self.on_parameters)
+
+    @property
+    def has_base(self):
+        return self.config.HasField("base_from_camera")
+
+    # The lifecycle.
+
+    def on_configure(self, state):
+        """Connects, and makes the topics and services."""
+        try:
+            self.channel = connection.channel(self.given)
+        except (OSError, ValueError) as error:
+            self.get_logger().error(str(error))
+            return TransitionCallbackReturn.FAILURE
+        self.stream = Stream(self.channel, self.config, connection.metadata(self.given))
         self.odom = self.create_publisher(Odometry, "~/odom", 10)
         self.pose = self.create_publisher(PoseWithCovarianceStamped, "~/pose", 10)
         self.diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        has_base = self.config.HasField("base_from_camera")
-        if self.given["tf"] not in TF:
-            raise ValueError(f"tf is {self.given['tf']!r}, and none of: {', '.join(TF)}")
-        if self.given["tf"] == "map_only" and not has_base:
-            raise ValueError("tf: map_only needs base_from_camera, and ~/wheels as the robot's odometry")
         self.tf = TransformBroadcaster(self) if self.given["tf"] != "none" else None
-        # The robot's own odometry of the frames that have no answer yet, by their stamps.
-        self.driven = collections.OrderedDict()
+        self.reset_service = self.create_service(Trigger, "~/reset", self.on_reset)
+        self.subscribe(self.has_base)
+        return TransitionCallbackReturn.SUCCESS
 
-        self.channel = connection.channel(self.given)
-        self.stream = Stream(self.channel, self.config, connection.metadata(self.given))
-        self.subscribe(has_base)
+    def on_activate(self, state):
+        """Opens the stream."""
+        self.is_active = True
+        self.thread = threading.Thread(target=self.follow, daemon=True)
+        self.thread.start()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_deactivate(self, state):
+        """Ends the stream. It is resumed when the node becomes active again."""
+        self.stop()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_cleanup(self, state):
+        """Removes the topics and the connection."""
+        self.stop()
+        self.destroy_service(self.reset_service)
+        for subscription in self.listened:
+            self.destroy_subscription(subscription)
+        for publisher in (self.odom, self.pose, self.diagnostics):
+            self.destroy_publisher(publisher)
+        self.listened = []
+        self.channel.close()
+        self.channel = None
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state):
+        self.stop()
+        if self.channel is not None:
+            self.channel.close()
+        return TransitionCallbackReturn.SUCCESS
+
+    def stop(self):
+        """Ends the stream and its thread."""
+        self.is_active = False
+        if self.thread is not None:
+            self.stream.cancel()
+            self.thread.join()
+            self.thread = None
+
+    # Services.
+
+    def on_reset(self, request, response):
+        """Restarts tracking: the camera was carried elsewhere."""
+        response.success = self.is_active
+        response.message = "tracking restarts" if self.is_active else "the node is not active"
+        if self.is_active:
+            self.offer(odometry_pb2.TrackRequest(reset=odometry_pb2.Reset()))
+        return response
+
+    def on_parameters(self, parameters):
+        """Changes the room or the adapter: a stream in the new one begins."""
+        other = [parameter.name for parameter in parameters if parameter.name not in CHANGEABLE]
+        if other and self.channel is not None:
+            reason = f"{', '.join(other)}: only {' and '.join(CHANGEABLE)} may be set while the node runs"
+            return SetParametersResult(successful=False, reason=reason)
+        for parameter in parameters:
+            if parameter.name in CHANGEABLE:
+                self.given[parameter.name] = parameter.value
+                setattr(self.config, parameter.name, parameter.value)
+        if self.channel is not None:
+            self.stream.begin_anew()
+        return SetParametersResult(successful=True, reason="")
 
     def numbers(self, name):
         """A parameter of numbers. It is declared by its type: the elements of an empty list have none."""
@@ -82,7 +169,7 @@ class Bridge(Node):
         given = self.given
         config = odometry_pb2.TrackConfig(
             room=given["room"], adapter=given["adapter"], back_pressure=odometry_pb2.BACK_PRESSURE_NEWEST,
-            frames=odometry_pb2.FrameNames(map=given["map_frame"], odom=given["odom_frame"], camera=given["camera_frame"],
+            frame_names=odometry_pb2.FrameNames(map=given["map_frame"], odom=given["odom_frame"], camera=given["camera_frame"],
                                           base=given["base_frame"]),
             base_from_camera=requests.mounting("base_from_camera", self.numbers("base_from_camera")),
             gravity_in_map=requests.direction("gravity_in_map", self.numbers("gravity_in_map")),
@@ -100,25 +187,32 @@ class Bridge(Node):
         return config
 
     def subscribe(self, has_base):
-        sensor = qos_profile_sensor_data
+        def listen(kind, topic, callback, qos=qos_profile_sensor_data):
+            # Nothing is sent while the node is not active.
+            def on_message(message):
+                if self.is_active:
+                    callback(message)
+
+            self.listened.append(self.create_subscription(kind, topic, on_message, qos))
+
         compressed, raw = requests.view_of_compressed, requests.view_of_raw
-        self.create_subscription(CompressedImage, "~/image", functools.partial(self.on_image, compressed), sensor)
-        self.create_subscription(Image, "~/image_raw", functools.partial(self.on_image, raw), sensor)
+        listen(CompressedImage, "~/image", functools.partial(self.on_image, compressed))
+        listen(Image, "~/image_raw", functools.partial(self.on_image, raw))
         for other in self.config.other_cameras:
             callback = functools.partial(self.on_other_image, other.name)
-            self.create_subscription(CompressedImage, f"~/{other.name}/image", functools.partial(callback, compressed), sensor)
-            self.create_subscription(Image, f"~/{other.name}/image_raw", functools.partial(callback, raw), sensor)
+            listen(CompressedImage, f"~/{other.name}/image", functools.partial(callback, compressed))
+            listen(Image, f"~/{other.name}/image_raw", functools.partial(callback, raw))
 
         if self.given["depth"]:
-            self.create_subscription(Image, "~/depth", self.on_depth, sensor)
+            listen(Image, "~/depth", self.on_depth)
 
-        self.create_subscription(PoseWithCovarianceStamped, "/initialpose", self.on_initial_pose, 10)
+        listen(PoseWithCovarianceStamped, "/initialpose", self.on_initial_pose, 10)
         if self.given["use_camera_info"]:
-            self.create_subscription(CameraInfo, "~/camera_info", self.on_camera_info, sensor)
+            listen(CameraInfo, "~/camera_info", self.on_camera_info)
         if has_base:
-            self.create_subscription(Odometry, "~/wheels", self.on_wheels, sensor)
+            listen(Odometry, "~/wheels", self.on_wheels)
         if self.config.HasField("gravity_in_map") or self.given["inertial"]:
-            self.create_subscription(Imu, "~/imu", self.on_imu, sensor)
+            listen(Imu, "~/imu", self.on_imu)
 
     # What sensors say.
 
@@ -140,13 +234,6 @@ class Bridge(Node):
         self.counts["images"] += 1
         stamp = requests.nanoseconds(image.header.stamp)
         frame = odometry_pb2.TrackFrame(timestamp_ns=stamp, sequence_number=self.counts["images"], view=view)
-        # Wheels that come less often than images are sent once: sent twice, the robot would stand still in between.
-        if self.wheels is not None and abs(self.wheels[0] - stamp) <= OLD_NS:
-            frame.odometry.CopyFrom(self.wheels[1])
-            self.driven[stamp] = self.wheels[1].pose
-            while len(self.driven) > MOST_DRIVEN:
-                self.driven.popitem(last=False)
-            self.wheels = None
         while self.samples and self.samples[0].timestamp_ns <= stamp:
             frame.inertial_samples.append(self.samples.popleft())
         # The accelerometer of an inertial sensor also shows which way is down.
@@ -179,7 +266,8 @@ class Bridge(Node):
             return
         stamp = self.waiting.timestamp_ns
         has_views = len(self.views_beside(stamp)) == len(self.config.other_cameras)
-        if has_views and (not self.given["depth"] or self.depth_at(stamp) is not None):
+        has_depth = not self.given["depth"] or self.depth_at(stamp) is not None
+        if has_views and has_depth and not self.wheels.are_awaited(stamp):
             self.send_waiting()
 
     def views_beside(self, stamp):
@@ -187,12 +275,19 @@ class Bridge(Node):
         return {name: view for name, (other, view) in self.beside.items() if abs(other - stamp) <= TOGETHER_NS}
 
     def send_waiting(self):
-        """Sends the frame that waits for depths and other cameras, with what has come: when all have, or at the next image."""
+        """Sends the frame that waits for wheels, depths and other cameras, with what has come: when all have, or at the
+        next image."""
         if self.waiting is None:
             return
-        for name, view in self.views_beside(self.waiting.timestamp_ns).items():
-            self.waiting.other_views.add(camera=name, view=view)
-        if (depth := self.depth_at(self.waiting.timestamp_ns)) is not None:
+        stamp = self.waiting.timestamp_ns
+        if (measured := self.wheels.at(stamp)) is not None:
+            self.waiting.odometry.CopyFrom(measured)
+            self.driven[stamp] = measured.pose
+            while len(self.driven) > MOST_DRIVEN:
+                self.driven.popitem(last=False)
+        for name, view in self.views_beside(stamp).items():
+            self.waiting.other_views.add(camera_name=name, view=view)
+        if (depth := self.depth_at(stamp)) is not None:
             self.waiting.depth.CopyFrom(depth)
         self.offer(odometry_pb2.TrackRequest(frame=self.waiting))
         self.waiting = None
@@ -212,13 +307,14 @@ class Bridge(Node):
         if camera is None:
             self.get_logger().warning(f"camera_info: {problem}: fields of view are not compared")
         else:
-            self.config.camera.CopyFrom(camera)
+            self.config.camera.intrinsics.CopyFrom(camera)
         self.begins.set()
 
     def on_wheels(self, message):
         measured = requests.measured_odometry(message, self.given["base_frame"], self.given["wheel_drift"],
                                               self.given["use_wheel_covariance"])
-        self.wheels = requests.nanoseconds(message.header.stamp), measured
+        self.wheels.add(requests.nanoseconds(message.header.stamp), measured)
+        self.send_complete()
 
     def on_imu(self, imu):
         if self.given["inertial"]:
@@ -273,7 +369,7 @@ class Bridge(Node):
         reason = odometry_pb2.TrackRefusalReason.Name(refusal.reason).removeprefix("TRACK_REFUSAL_REASON_")
         if reason == "SUPERSEDED":
             # Frames that a newer one overtook are no fault.
-            self.counts["images overtaken"] += refusal.frames
+            self.counts["images overtaken"] += refusal.frame_count
             return
         self.counts["refusals"] += 1
         text = f"refused, {reason}: {refusal.message}"
@@ -281,7 +377,8 @@ class Bridge(Node):
         self.report(1, text, refusal.timestamp_ns)
 
     def follow(self):
-        """Takes the server's answers until the node ends; what nobody expected ends the node, so that it is started again."""
+        """Takes the server's answers while the node is active; what nobody expected ends the node, so that it is started
+        again."""
         try:
             self.take_answers()
         except Exception as error:
@@ -291,10 +388,10 @@ class Bridge(Node):
             raise
 
     def take_answers(self):
-        while rclpy.ok() and not self.begins.wait(timeout=1.0):
+        while rclpy.ok() and self.is_active and not self.begins.wait(timeout=1.0):
             self.get_logger().warning("waiting for camera_info", throttle_duration_sec=10.0)
 
-        while rclpy.ok():
+        while rclpy.ok() and self.is_active:
             try:
                 for answer in self.stream.answers():
                     kind = answer.WhichOneof("answer")
@@ -303,8 +400,10 @@ class Bridge(Node):
                     elif kind == "refusal":
                         self.refused(answer.refusal)
             except grpc.RpcError as error:
-                if not rclpy.ok():
+                if not rclpy.ok() or not self.is_active:
                     return
+                if self.stream.was_cancelled():
+                    continue
                 text = f"{error.code().name}: {error.details()}"
                 self.get_logger().warning(text)
                 self.report(2, text, self.get_clock().now().nanoseconds)
@@ -319,17 +418,18 @@ class Bridge(Node):
 def main():
     rclpy.init()
     node = Bridge()
-    thread = threading.Thread(target=node.follow)
-    thread.start()
     try:
-        rclpy.spin(node)
+        if node.given["autostart"]:
+            node.has_failed = node.trigger_configure() != TransitionCallbackReturn.SUCCESS
+            if not node.has_failed:
+                node.trigger_activate()
+        if not node.has_failed:
+            rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
         rclpy.try_shutdown()
-        # Ends the call, and with it the thread.
-        node.channel.close()
-        thread.join()
+        node.stop()
         node.destroy_node()
     # What starts nodes again tells by this that it should.
     sys.exit(1 if node.has_failed else 0)

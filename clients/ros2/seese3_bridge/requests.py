@@ -1,5 +1,6 @@
 """What the robot's sensors say, as messages of the server's protocol."""
 
+import collections
 import io
 import math
 
@@ -16,6 +17,10 @@ DEPTHS = {"16UC1": ("u2", 0.001), "32FC1": ("f4", 1.0)}
 MOST = 100.0, 1_000.0
 # The acceleration of a robot that drives is averaged over this time for the direction of gravity, seconds.
 AVERAGED_S = 1.0
+# What another sensor said so long ago says nothing of a frame, nanoseconds.
+OLD_NS = 50_000_000
+# Odometry is interpolated over at most this time, nanoseconds.
+LONGEST_GAP_NS = 200_000_000
 
 
 def nanoseconds(stamp):
@@ -128,6 +133,66 @@ def measured_odometry(message, base_frame, drift, with_covariance):
     return odometry_pb2.MeasuredOdometry(pose=wire_pose(message.pose.pose, "", base_frame),
                                          translation_share=drift, rotation_share=drift,
                                          velocity_covariance=covariance if any(covariance) else [])
+
+
+class Wheels:
+    """The odometry of the wheels at the times of images: interpolated between the messages before and after."""
+
+    def __init__(self):
+        self.messages = collections.deque(maxlen=200)
+        # The time of the message that was last used as it is.
+        self.used_ns = None
+
+    def add(self, stamp, measured):
+        """Adds a message. One that is older than the last is left out."""
+        if not self.messages or stamp > self.messages[-1][0]:
+            self.messages.append((stamp, measured))
+
+    def are_awaited(self, stamp):
+        """Whether a message after this time may still come: the last one is just before it."""
+        return bool(self.messages) and 0 < stamp - self.messages[-1][0] <= OLD_NS
+
+    def at(self, stamp):
+        """The odometry at a time; None if it is not known.
+
+        After the last message it is that message's, but only once: sent twice, the robot would stand still in between."""
+        before = [message for message in self.messages if message[0] <= stamp]
+        after = [message for message in self.messages if message[0] > stamp]
+        if before and after and after[0][0] - before[-1][0] <= LONGEST_GAP_NS:
+            (start, first), (end, second) = before[-1], after[0]
+            return interpolated(first, second, (stamp - start) / (end - start))
+        nearest = min((before[-1:] + after[:1]), key=lambda message: abs(message[0] - stamp), default=None)
+        if nearest is None or abs(nearest[0] - stamp) > OLD_NS or nearest[0] == self.used_ns:
+            return None
+        self.used_ns = nearest[0]
+        return nearest[1]
+
+
+def interpolated(first, second, share):
+    """Odometry between two measurements, by the share of the time from the first to the second."""
+    found = odometry_pb2.MeasuredOdometry()
+    found.CopyFrom(second)
+    a, b = first.pose, second.pose
+    for axis in "xyz":
+        start = getattr(a.position, axis)
+        setattr(found.pose.position, axis, start + share * (getattr(b.position, axis) - start))
+
+    # Spherical linear interpolation, along the shorter arc.
+    p = [getattr(a.orientation, name) for name in "wxyz"]
+    q = [getattr(b.orientation, name) for name in "wxyz"]
+    cosine = sum(x * y for x, y in zip(p, q))
+    if cosine < 0:
+        q, cosine = [-y for y in q], -cosine
+    angle = math.acos(min(1.0, cosine))
+    if angle < 1e-6:
+        weights = 1 - share, share
+    else:
+        weights = math.sin((1 - share) * angle) / math.sin(angle), math.sin(share * angle) / math.sin(angle)
+    mixed = [weights[0] * x + weights[1] * y for x, y in zip(p, q)]
+    norm = math.sqrt(sum(x * x for x in mixed))
+    for name, value in zip("wxyz", mixed):
+        setattr(found.pose.orientation, name, value / norm)
+    return found
 
 
 def inertial_sample(imu):

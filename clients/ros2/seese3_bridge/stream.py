@@ -66,10 +66,28 @@ class Stream:
         self.stub, self.config, self.token = stub("OdometryService", channel), config, b""
         self.metadata = metadata
         self.requests = Requests()
+        self.call, self.is_cancelled = None, False
 
     def offer(self, request):
         """Adds a request; returns whether another was dropped for it."""
         return self.requests.offer(request)
+
+    def cancel(self):
+        """Ends the current call."""
+        self.is_cancelled = True
+        self.requests.begin()
+        if self.call is not None:
+            self.call.cancel()
+
+    def begin_anew(self):
+        """Ends the current call; the next one begins with the configuration, and not with the last token."""
+        self.token = b""
+        self.cancel()
+
+    def was_cancelled(self):
+        """Whether the last call ended by `cancel`, which is then forgotten."""
+        is_cancelled, self.is_cancelled = self.is_cancelled, False
+        return is_cancelled
 
     def sent(self, call):
         resumed = odometry_pb2.TrackConfig(resume_token=self.token)
@@ -79,9 +97,12 @@ class Stream:
     def answers(self):
         """Answers until the call ends."""
         call = self.requests.begin()
+        self.is_cancelled = False
+        self.call = self.stub.Track(self.sent(call), metadata=self.metadata)
         try:
-            for answer in self.stub.Track(self.sent(call), metadata=self.metadata):
-                self.token = answer.resume_token or self.token
+            for answer in self.call:
+                if not self.is_cancelled:
+                    self.token = answer.resume_token or self.token
                 yield answer
         finally:
             self.requests.begin()

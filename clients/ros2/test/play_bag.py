@@ -9,7 +9,6 @@ come compressed and raw by turns, with CameraInfo, the odometry of wheels that a
 import argparse
 import io
 import tempfile
-import threading
 import time
 from pathlib import Path
 
@@ -178,11 +177,12 @@ def main():
         "other_cameras": ["second"], "second.base_from_camera": BASE_FROM_CAMERA, "inertial": given.inertial,
     }
     node = bridge_node.Bridge()
+    assert node.trigger_configure() == "success"
     sent = []
     offer = node.stream.offer
-    node.stream.offer = lambda request: sent.append(request.frame) or offer(request)
-    thread = threading.Thread(target=node.follow, daemon=True)
-    thread.start()
+    node.stream.offer = lambda request: (sent.append(request.frame) if request.HasField("frame") else None) or offer(request)
+    assert not node.call("~/reset").success
+    assert node.trigger_activate() == "success"
 
     bases = numpy.load(Path(given.numpy) / "poses.npy") @ numpy.linalg.inv(matrix(BASE_FROM_CAMERA))
     images = sorted(Path(given.images).glob("*.png"))
@@ -214,7 +214,32 @@ def main():
     # An encoding that cannot be read is said, and the stream goes on.
     node.deliver("~/image_raw", Image(width=2, height=2, step=2, encoding="bayer_rggb8", data=b"abcd"))
     assert "bayer_rggb8" in node.logger.lines[-1] and node.counts["images not sent"] == 1
-    node.channel.close()
+
+    lifecycle(node, given.room)
+
+
+def lifecycle(node, room):
+    """Tracking restarts, the room is set again, and the node is stopped, started and cleaned up."""
+    def ends_with(status):
+        until = time.monotonic() + 60
+        while time.monotonic() < until:
+            messages = node.published["/diagnostics"].messages
+            if messages and messages[-1].status[0].message.startswith(status):
+                return
+            time.sleep(0.01)
+        raise AssertionError(f"no {status}: {messages[-1].status[0].message}")
+
+    assert node.call("~/reset").success
+    assert not node.set_parameters(tf="none").successful
+    assert not node.set_parameters(room="nowhere", wheel_drift=0.1).successful and node.config.room == room
+    assert node.set_parameters(room="nowhere").successful
+    ends_with("NOT_FOUND")
+    assert node.set_parameters(room=room).successful
+    assert node.trigger_deactivate() == "success" and node.thread is None
+    assert node.trigger_activate() == "success" and node.thread.is_alive()
+    assert node.trigger_deactivate() == "success"
+    assert node.trigger_cleanup() == "success"
+    assert not node.published and not node.subscribed and not node.services
 
 
 if __name__ == "__main__":

@@ -1,6 +1,8 @@
-"""Stands in for ROS where there is none: message classes by the definitions that the library rosbags has of ROS 2 Humble, and
-so much of rclpy as the bridge uses. A test publishes by calling Node.deliver and reads Node.published."""
+"""Stands in for ROS where there is none: message classes by the definitions that the library rosbags has of a ROS 2
+distribution, and so much of rclpy as the bridge uses. The variable ROS_DISTRO names the distribution, humble or jazzy. A
+test publishes by calling Node.deliver and reads Node.published."""
 
+import os
 import sys
 import types
 
@@ -8,7 +10,7 @@ import numpy
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.base import Nodetype
 
-STORE = get_typestore(Stores.ROS2_HUMBLE)
+STORE = get_typestore({"humble": Stores.ROS2_HUMBLE, "jazzy": Stores.ROS2_JAZZY}[os.environ.get("ROS_DISTRO", "humble")])
 MESSAGES = {
     "diagnostic_msgs": ["DiagnosticArray", "DiagnosticStatus", "KeyValue"],
     "geometry_msgs": ["PoseWithCovarianceStamped", "TransformStamped"],
@@ -95,12 +97,13 @@ class Value:
 
 
 class Node:
-    """A node whose parameters a test sets in Node.given before it is made."""
+    """A lifecycle node whose parameters a test sets in Node.given before it is made."""
 
     given = {}
 
     def __init__(self, name):
         self.name, self.published, self.subscribed, self.logger = name, {}, {}, Logger()
+        self.services, self.set_parameters_callback = {}, None
 
     def declare_parameter(self, name, plain_value):
         return Value(Node.given.get(name, None if isinstance(plain_value, str) and plain_value.startswith("type ") else plain_value))
@@ -111,6 +114,44 @@ class Node:
 
     def create_subscription(self, kind, topic, callback, _):
         self.subscribed[topic] = kind, callback
+        return topic
+
+    def create_service(self, kind, name, callback):
+        self.services[name] = kind, callback
+        return name
+
+    def call(self, name):
+        """Calls a service, and returns its response."""
+        kind, callback = self.services[name]
+        return callback(kind.Request(), kind.Response())
+
+    def add_on_set_parameters_callback(self, callback):
+        self.set_parameters_callback = callback
+
+    def set_parameters(self, **values):
+        """What `ros2 param set` does."""
+        return self.set_parameters_callback([types.SimpleNamespace(name=name, value=value) for name, value in values.items()])
+
+    def trigger_configure(self):
+        return self.on_configure(None)
+
+    def trigger_activate(self):
+        return self.on_activate(None)
+
+    def trigger_deactivate(self):
+        return self.on_deactivate(None)
+
+    def trigger_cleanup(self):
+        return self.on_cleanup(None)
+
+    def destroy_service(self, name):
+        del self.services[name]
+
+    def destroy_subscription(self, topic):
+        del self.subscribed[topic]
+
+    def destroy_publisher(self, publisher):
+        self.published = {topic: other for topic, other in self.published.items() if other is not publisher}
 
     def deliver(self, topic, message):
         """What a subscription to a topic gets; nothing where there is none."""
@@ -145,7 +186,11 @@ def install():
         "rclpy": {"init": lambda: None, "ok": lambda: is_up["up"], "spin": lambda node: None,
                   "try_shutdown": lambda: is_up.update(up=False)},
         "rclpy.executors": {"ExternalShutdownException": type("ExternalShutdownException", (Exception,), {})},
-        "rclpy.node": {"Node": Node},
+        "rclpy.lifecycle": {"LifecycleNode": Node, "TransitionCallbackReturn": types.SimpleNamespace(
+            SUCCESS="success", FAILURE="failure")},
+        "rcl_interfaces": {}, "rcl_interfaces.msg": {"SetParametersResult": types.SimpleNamespace},
+        "std_srvs": {}, "std_srvs.srv": {"Trigger": types.SimpleNamespace(
+            Request=types.SimpleNamespace, Response=types.SimpleNamespace)},
         "rclpy.parameter": {"Parameter": types.SimpleNamespace(
             Type=types.SimpleNamespace(DOUBLE_ARRAY="type double array", STRING_ARRAY="type string array"))},
         "rclpy.qos": {"qos_profile_sensor_data": "sensor data"},

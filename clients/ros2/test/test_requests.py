@@ -13,7 +13,7 @@ stand_in.install()
 from nav_msgs.msg import Odometry  # noqa: E402
 from seese3_bridge import requests  # noqa: E402
 from seese3_bridge.stream import Requests  # noqa: E402
-from seese3_bridge.v1 import odometry_pb2  # noqa: E402
+from seese3_bridge.v1 import geometry_pb2, odometry_pb2  # noqa: E402
 from sensor_msgs.msg import CameraInfo, Image, Imu  # noqa: E402
 
 
@@ -209,3 +209,35 @@ def test_the_covariance_of_wheels_is_taken_if_it_is_asked_for():
     assert list(known[0]) == list(message.twist.covariance) and not known[1]
     message.twist.covariance = [0.0] * 36
     assert not requests.measured_odometry(message, "base_link", 0.05, True).velocity_covariance
+
+
+def turned(degrees, x):
+    half = math.radians(degrees) / 2
+    pose = geometry_pb2.Pose(position=geometry_pb2.Vector3(x=x),
+                             orientation=geometry_pb2.Quaternion(w=math.cos(half), z=math.sin(half)))
+    return odometry_pb2.MeasuredOdometry(pose=pose)
+
+
+def test_wheels_are_interpolated_to_the_time_of_the_image():
+    """Oracle: by hand: a quarter of the way from 0 m and 0 degrees to 2 m and 80 degrees."""
+    wheels = requests.Wheels()
+    wheels.add(100_000_000, turned(0, 0.0))
+    assert wheels.are_awaited(110_000_000) and not wheels.are_awaited(100_000_000) and not wheels.are_awaited(500_000_000)
+    wheels.add(140_000_000, turned(80, 2.0))
+    found = wheels.at(110_000_000).pose
+    assert found.position.x == pytest.approx(0.5)
+    assert 2 * math.degrees(math.atan2(found.orientation.z, found.orientation.w)) == pytest.approx(20)
+    # The other sign of a quaternion is the same rotation.
+    other = turned(80, 2.0)
+    other.pose.orientation.w, other.pose.orientation.z = -other.pose.orientation.w, -other.pose.orientation.z
+    again = requests.interpolated(turned(0, 0.0), other, 0.25).pose
+    assert again.orientation.z / again.orientation.w == pytest.approx(found.orientation.z / found.orientation.w)
+
+
+def test_the_last_message_of_the_wheels_is_used_once():
+    wheels = requests.Wheels()
+    assert wheels.at(0) is None
+    wheels.add(100_000_000, turned(0, 1.0))
+    assert wheels.at(120_000_000).pose.position.x == 1.0
+    assert wheels.at(140_000_000) is None, "twice the same pose is a robot that stands still"
+    assert wheels.at(900_000_000) is None

@@ -112,6 +112,24 @@ impl Client {
             .results)
     }
 
+    /// Several localization requests in one call. Results are in the order of the requests.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] if the whole batch is refused. The failure of a single request is part of
+    /// the results.
+    pub async fn batch_localize(
+        &self,
+        requests: Vec<pb::LocalizeRequest>,
+    ) -> Result<Vec<pb::BatchLocalizeResult>, Error> {
+        let mut service = LocalizationServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
+        Ok(self
+            .in_time(service.batch_localize(self.request(pb::BatchLocalizeRequest { requests })))
+            .await?
+            .into_inner()
+            .results)
+    }
+
     /// Plans a route to a goal.
     ///
     /// # Errors
@@ -288,6 +306,64 @@ impl Client {
             room_revision: None,
         });
         Ok(self.in_time(service.get_room(request)).await?.into_inner())
+    }
+
+    /// A room's frames, features and keypoints. `take` is called for each message; its error ends the
+    /// download.
+    ///
+    /// # Errors
+    /// [`Error::Refused`], [`Error::Deadline`] if no message comes for as long as the deadline, or
+    /// the error of `take`.
+    pub async fn download_room<E: From<Error>>(
+        &self,
+        request: pb::DownloadRoomRequest,
+        mut take: impl FnMut(pb::DownloadRoomResponse) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let mut service = CatalogServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
+        let opened = self.in_time(service.download_room(request)).await?;
+        let mut messages = opened.into_inner();
+        while let Some(message) = self.in_time(messages.message()).await? {
+            take(message)?;
+        }
+        Ok(())
+    }
+
+    /// An adapter's manifest and weights, with its revision.
+    ///
+    /// # Errors
+    /// [`Error::Refused`], [`Error::Deadline`] if no message comes for as long as the deadline, or
+    /// [`Error::NoReport`] if the stream has no manifest.
+    pub async fn download_adapter(
+        &self,
+        request: pb::DownloadAdapterRequest,
+    ) -> Result<(pb::AdapterDownload, Vec<u8>), Error> {
+        use pb::download_adapter_response::Message;
+
+        let mut service = CatalogServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
+        let opened = self.in_time(service.download_adapter(request)).await?;
+        let mut messages = opened.into_inner();
+        let (mut adapter, mut weights) = (None, Vec::new());
+        while let Some(received) = self.in_time(messages.message()).await? {
+            match received.message {
+                Some(Message::Adapter(first)) => adapter = Some(first),
+                Some(Message::Weights(part)) => weights.extend(part),
+                None => {}
+            }
+        }
+        Ok((adapter.ok_or(Error::NoReport)?, weights))
+    }
+
+    /// All defaults that were set.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn defaults(&self) -> Result<Vec<pb::CatalogDefault>, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone());
+        let request = self.request(pb::ListDefaultsRequest {});
+        let answer = self.in_time(service.list_defaults(request)).await?;
+        Ok(answer.into_inner().defaults)
     }
 
     /// All adapters, read page by page.

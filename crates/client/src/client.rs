@@ -74,20 +74,11 @@ impl Error {
             return None;
         };
 
-        // An invalid value is reported in `BadRequest`, an unknown name in `ResourceInfo` with the
-        // field as its type.
         let details = status.get_error_details();
         let violation = details
             .bad_request()
             .and_then(|bad| bad.field_violations.first());
-
-        let resource = details
-            .resource_info()
-            .map(|resource| resource.resource_type.clone());
-
-        violation
-            .map(|violation| violation.field.clone())
-            .or(resource)
+        violation.map(|violation| violation.field.clone())
     }
 }
 
@@ -210,6 +201,14 @@ impl Client {
             problem: error.to_string(),
         })?;
 
+        // A URL has the port of its scheme; an address without one was typed incompletely.
+        if !address.contains("://") && endpoint.uri().port().is_none() {
+            return Err(Error::Address {
+                address: address.to_owned(),
+                problem: "it has no port; the servers' default is 50051".to_owned(),
+            });
+        }
+
         let within = deadline.min(LONGEST_CONNECTING);
         let mut endpoint = endpoint
             .connect_timeout(within)
@@ -241,7 +240,10 @@ impl Client {
         // tonic's error is only "transport error"; its source has the cause.
         let channel = connected.map_err(|error| {
             let cause = std::error::Error::source(&error);
-            failed(cause.map_or(error.to_string(), ToString::to_string))
+            let cause = cause.map_or(error.to_string(), ToString::to_string);
+            failed(format!(
+                "{cause}; is a server running there? `seese3 serve` starts one"
+            ))
         })?;
 
         Ok(Self {
@@ -283,6 +285,14 @@ mod tests {
         };
         let refused = Client::connect_with("http://127.0.0.1:9", options).await;
         assert!(matches!(refused, Err(Error::Address { .. })), "{refused:?}");
+    }
+
+    /// Oracle: by hand: nobody listens at the port of HTTP.
+    #[tokio::test]
+    async fn an_address_needs_a_port() {
+        let refused = Client::connect("localhost", Duration::from_secs(1)).await;
+        let message = refused.unwrap_err().to_string();
+        assert!(message.contains("has no port"), "{message}");
     }
 
     /// Oracle: the contract: a server's refusal is quoted in one line; a broken connection is no

@@ -43,6 +43,11 @@
 //!
 //! The feature `server` adds the server side of the protocol; clients do not need it.
 
+/// The examples of the repository's README, which are compiled with the tests.
+#[cfg(doctest)]
+#[doc = include_str!("../../../README.md")]
+struct Readme;
+
 pub mod proto;
 mod checked_status;
 mod one_line;

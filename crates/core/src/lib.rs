@@ -96,6 +96,7 @@ pub mod index;
 pub mod ridge;
 pub mod splits;
 pub mod statistics;
+pub mod recording_extent;
 pub mod motion_scores;
 pub mod trajectory;
 pub mod epipolar;

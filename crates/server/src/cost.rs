@@ -2,10 +2,11 @@
 //!
 //! Time is counted in comparisons: one comparison of a view with one stored frame, about 10 ns.
 
+use super::Error;
 use super::snapshot::Snapshot;
-use super::workers::{Lane, image_count};
+use super::workers::{Lane, image_count, images_of};
 use seese3_client::proto::v1 as pb;
-use seese3_core::navigation::IndexKind;
+use seese3_core::navigation::{IndexKind, Limits};
 use seese3_core::room::Room;
 
 /// Cost limit of the lane for short requests, comparisons: about 10 ms.
@@ -93,11 +94,55 @@ pub fn lane(images: usize, comparisons: f64) -> Lane {
     }
 }
 
+/// Checks the size of a batch. `frames` are the numbers of frames that its requests ask for.
+///
+/// # Errors
+/// [`Error::Invalid`] if the batch is empty, or is over the limit on requests or on frames.
+pub fn check_batch(
+    frames: impl ExactSizeIterator<Item = u64>,
+    most: usize,
+    limits: Limits,
+) -> Result<(), Error> {
+    let count = frames.len();
+    if count == 0 || count > most {
+        let problem = format!("needs 1 to {most}, got {count}");
+        return Err(Error::invalid("requests", problem));
+    }
+
+    // The limit on retrieved frames bounds the size of the answer, so it applies to the whole
+    // batch.
+    let in_all = frames.fold(0, u64::saturating_add);
+    if in_all > limits.frames_in_answer {
+        let problem = format!(
+            "ask for {in_all} frames together, over the limit of {}",
+            limits.frames_in_answer
+        );
+        return Err(Error::invalid("requests", problem));
+    }
+    Ok(())
+}
+
+/// Checks the number of pixels of a batch's images. The limit is the same for all adapters.
+///
+/// # Errors
+/// [`Error::Invalid`] if it is over the limit.
+pub fn check_batch_pixels<'a>(
+    snapshot: &Snapshot,
+    views: impl Iterator<Item = &'a pb::View> + Clone,
+) -> Result<(), Error> {
+    match snapshot.any_image_encoder() {
+        Some(encoder) if image_count(views.clone()) > 0 => {
+            encoder.check_pixels("requests", images_of(views))
+        }
+        _ => Ok(()),
+    }
+}
+
 /// Number of steps that a Navigate request asks for, of all motions.
 pub fn step_count(request: &pb::NavigateRequest) -> u64 {
-    let displacement = request.displacement.as_ref();
-    let motions = match displacement.and_then(|given| given.displacement.as_ref()) {
-        Some(pb::displacement::Displacement::Twists(list)) => list.twists.len() as u64,
+    let motion = request.motion.as_ref();
+    let motions = match motion.and_then(|given| given.motion.as_ref()) {
+        Some(pb::requested_motion::Motion::Twists(list)) => list.twists.len() as u64,
         _ => 1,
     };
 

@@ -129,8 +129,9 @@ impl ViewEmbedder<'_> {
                     }
                 };
 
-                let unknown = |_| Error::no_frame(&frame_field, frame);
-                served.navigator.room().pose(frame).map_err(unknown)?;
+                let room = served.navigator.room();
+                let unknown = |_| Error::no_frame(&frame_field, frame, room.frame_count());
+                room.pose(frame).map_err(unknown)?;
                 Ok(EmbeddedView {
                     latent: served.navigator.latents().row(frame.row()).to_owned(),
                     feature: None,

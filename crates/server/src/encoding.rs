@@ -73,7 +73,7 @@ fn answer(
                 .filter(|_| with_features)
                 .map(|values| pb::Feature {
                     values,
-                    source_name: chosen.stored.adapter.source().name.clone(),
+                    feature_set: chosen.stored.adapter.source().name.clone(),
                 }),
         });
     }

@@ -205,9 +205,11 @@ fn report_to_wire(
         adapter: Some(convert::adapter_revision(served)),
         split: convert::split_to_wire(report.protocol.split).into(),
         stride: report.protocol.stride,
-        n: report.n as u32,
+        pair_count: report.n as u32,
         candidate_count: report.candidate_count as u32,
-        source_excluded: report.protocol.exclude_source.is_some(),
+        exclude_source: report.protocol.exclude_source.is_some(),
+        exclude_radius: report.protocol.exclude_source.unwrap_or_default(),
+        seed: report.protocol.seed,
         steps: report.protocol.steps,
         step_mode: convert::mode_to_wire(report.protocol.mode).into(),
         in_room,
@@ -221,8 +223,8 @@ fn list_pairs(
     snapshot: &Snapshot,
     request: pb::ListPairsRequest,
 ) -> Result<pb::ListPairsResponse, Error> {
-    /// Upper bound of the encoded size of a frame's row, bytes.
-    const ROW_BYTES: usize = 5;
+    /// Upper bound of the encoded size of a frame's row with its tag, bytes.
+    const ROW_BYTES: usize = 7;
 
     let pb::ListPairsRequest {
         room,
@@ -258,18 +260,21 @@ fn list_pairs(
     // A split without training pairs can still be tested.
     let training = training.unwrap_or_default();
 
-    let sources = |pairs: &[Pair]| pairs.iter().map(|pair| pair.source.0).collect();
-    let targets = |pairs: &[Pair]| pairs.iter().map(|pair| pair.target.0).collect();
+    let pairs_to_wire = |pairs: &[Pair]| {
+        let pairs = pairs.iter().map(|pair| pb::FramePair {
+            source_frame_id: pair.source.0,
+            target_frame_id: pair.target.0,
+        });
+        pairs.collect()
+    };
     let candidates = split.candidates(timeline);
     Ok(pb::ListPairsResponse {
         room: Some(convert::served_revision(served)),
         split: convert::split_to_wire(split).into(),
         stride,
-        test_sources: sources(&test),
-        test_targets: targets(&test),
-        training_sources: sources(&training),
-        training_targets: targets(&training),
-        candidates: candidates.iter().map(|frame| frame.0).collect(),
+        test_pairs: pairs_to_wire(&test),
+        training_pairs: pairs_to_wire(&training),
+        candidate_frame_ids: candidates.iter().map(|frame| frame.0).collect(),
     })
 }
 

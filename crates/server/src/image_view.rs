@@ -4,9 +4,10 @@ use std::cell::RefCell;
 use std::cmp::Reverse;
 use std::sync::Arc;
 
+use super::Error;
+use super::convert::{self, ImageCamera};
 use super::image_encoder::ImageEncoder;
 use super::snapshot::{ServedRoom, Snapshot};
-use super::{Error, convert};
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
 use seese3_core::geometry::CameraIntrinsics;
@@ -54,15 +55,9 @@ pub struct ImageView<'a> {
     fields: ViewFields<'a>,
     snapshot: &'a Snapshot,
     image: RgbImage,
-    camera: GivenCamera,
+    camera: ImageCamera,
     /// One pass of each encoder of keypoints.
     passes: RefCell<Vec<Arc<Pass>>>,
-}
-
-enum GivenCamera {
-    Stated(CameraIntrinsics),
-    /// The camera that mapped the room.
-    Mapping,
 }
 
 /// One encoder pass over the image.
@@ -136,7 +131,7 @@ impl<'a> ImageView<'a> {
         rooms: &[Arc<ServedRoom>],
     ) -> Result<Option<Self>, Error> {
         let camera = camera
-            .map(|camera| given_camera(fields.camera, camera))
+            .map(|camera| convert::image_camera(fields.camera, camera))
             .transpose()?;
         let view = view.and_then(|view| view.view.as_ref());
         let Some(pb::view::View::Image(bytes)) = view else {
@@ -156,7 +151,7 @@ impl<'a> ImageView<'a> {
         })?;
 
         let image = encoder.decoded(&format!("{}.image", fields.view), bytes)?;
-        if let GivenCamera::Stated(camera) = &camera {
+        if let ImageCamera::Stated(camera) = &camera {
             check_aspect(image.width, image.height, camera)
                 .map_err(|problem| Error::invalid(format!("{}.image", fields.view), problem))?;
         }
@@ -223,8 +218,8 @@ impl<'a> ImageView<'a> {
         };
 
         let camera = match &self.camera {
-            GivenCamera::Stated(camera) => *camera,
-            GivenCamera::Mapping => mapped.room.map().camera,
+            ImageCamera::Stated(camera) => *camera,
+            ImageCamera::Mapping => mapped.room.map().camera,
         };
         match check_aspect(self.image.width, self.image.height, &camera) {
             Ok(()) => {}
@@ -298,32 +293,4 @@ fn first_with_keypoints<'a>(
         let source = room.summary.keypoints.as_ref()?;
         Some((room.as_ref(), snapshot.keypoint_encoder(source)?))
     })
-}
-
-fn given_camera(field: &str, camera: &pb::ViewCamera) -> Result<GivenCamera, Error> {
-    use pb::view_camera::Camera;
-
-    match &camera.camera {
-        Some(Camera::Intrinsics(intrinsics)) => match convert::camera(intrinsics) {
-            Ok(camera) => Ok(GivenCamera::Stated(camera)),
-            // The field begins with `camera`, as in other requests.
-            Err(Error::Invalid {
-                field: part,
-                problem,
-            }) => {
-                let part = part.strip_prefix("camera").unwrap_or_default();
-                Err(Error::invalid(format!("{field}.intrinsics{part}"), problem))
-            }
-            Err(other) => Err(other),
-        },
-        Some(Camera::MappingCamera(true)) => Ok(GivenCamera::Mapping),
-        Some(Camera::MappingCamera(false)) => Err(Error::invalid(
-            format!("{field}.mapping_camera"),
-            "must be true; state the intrinsics of another camera",
-        )),
-        None => Err(Error::invalid(
-            field,
-            "has no value: state the intrinsics, or mapping_camera",
-        )),
-    }
 }

@@ -48,6 +48,9 @@ mod cost;
 mod embedding;
 mod image_view;
 mod reload;
+mod received_keypoints;
+mod received_room;
+mod room_messages;
 mod catalog;
 mod localization;
 mod evaluation;
@@ -62,7 +65,9 @@ pub use auth::{AuthError, Keyring};
 pub use convert::{camera_to_wire, source_to_wire};
 pub use image_encoder::ImageEncoders;
 pub use metrics::Metrics;
+pub use received_room::{CompleteRoom, ReceivedRoom};
 pub use reload::Reload;
+pub use room_messages::{MESSAGE_BYTES, RoomPart, RoomParts, Unsendable, room_upload};
 pub use seese3_store::Quota;
 pub use shutdown::shutdown_signal;
 pub use snapshot::{RoomMemory, Snapshot};
@@ -276,6 +281,8 @@ struct Handlers {
     config: Arc<Config>,
     /// Places for open Track streams, divided between callers.
     streams: Arc<Shares>,
+    /// The store, for downloads and lists of what is not in memory.
+    store: Store,
     /// Applies changes of the catalog; `None` if the server is read-only.
     changes: Option<Arc<Changes>>,
 }
@@ -364,6 +371,7 @@ pub async fn run(
         workers: workers.clone(),
         config: Arc::new(config.clone()),
         streams: Shares::new(config.streams),
+        store: store.clone(),
         changes: config.writable.then(|| Arc::new(changes)),
     };
     let answering = server(handlers, watched.clone(), grpc, async {

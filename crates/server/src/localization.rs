@@ -7,9 +7,11 @@ use std::sync::Arc;
 use tonic::{Request, Response, Status};
 
 use super::convert;
+use super::cost::{check_batch, check_batch_pixels};
 use super::image_view::{ImageView, RoomMatches, Searched, ViewFields};
 use super::snapshot::{ServedNavigator, ServedRoom};
 use super::status::view_error;
+use super::workers::Lane;
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::localization_service_server::LocalizationService;
@@ -17,7 +19,7 @@ use seese3_core::cancel::Cancellation;
 use seese3_core::keypoints::KeypointSource;
 use seese3_core::localization::{Place, localize};
 use seese3_core::navigation::{Error as E, Source, Start, StepError};
-use seese3_core::room::{self, RoomId};
+use seese3_core::room::{self, FrameId, RoomId};
 use seese3_robot::fitting::{MotionReader, RoomReader};
 use seese3_robot::localization::{
     AdapterLocalizer, LocatedView, Method, NotInRoom, NotLocated, PoseEstimate,
@@ -31,6 +33,26 @@ impl LocalizationService for Handlers {
         request: Request<pb::RelocalizeRequest>,
     ) -> Result<Response<pb::RelocalizeResponse>, Status> {
         self.relocalized(request).await
+    }
+
+    async fn batch_localize(
+        &self,
+        request: Request<pb::BatchLocalizeRequest>,
+    ) -> Result<Response<pb::BatchLocalizeResponse>, Status> {
+        let limits = self.config.limits;
+        let most = self.config.batch;
+        self.unary(
+            request,
+            |_, _| Lane::Long,
+            move |snapshot, request, cancel| {
+                let frames = |request: &pb::LocalizeRequest| request.top_k.unwrap_or(1).into();
+                check_batch(request.requests.iter().map(frames), most, limits)?;
+                let views = request.requests.iter();
+                check_batch_pixels(snapshot, views.filter_map(|request| request.view.as_ref()))?;
+                answer_batch(snapshot, request, limits.top_k, cancel)
+            },
+        )
+        .await
     }
 
     async fn localize(
@@ -53,6 +75,31 @@ impl LocalizationService for Handlers {
 
         Ok(response)
     }
+}
+
+fn answer_batch(
+    snapshot: &Snapshot,
+    batch: pb::BatchLocalizeRequest,
+    most: u32,
+    cancel: &Cancellation,
+) -> Result<pb::BatchLocalizeResponse, Error> {
+    use pb::batch_localize_result::Result as Wire;
+
+    let mut results = Vec::with_capacity(batch.requests.len());
+    for request in batch.requests {
+        cancel.check()?;
+        let result = match answer(snapshot, request, most, cancel) {
+            Ok(response) => Wire::Response(response),
+            // Cancellation ends the batch; any other error fails only its own request.
+            Err(Error::Cancelled) => return Err(Error::Cancelled),
+            Err(error) => Wire::Error(error.into()),
+        };
+        results.push(pb::BatchLocalizeResult {
+            result: Some(result),
+        });
+    }
+
+    Ok(pb::BatchLocalizeResponse { results })
 }
 
 fn answer(
@@ -86,6 +133,10 @@ fn answer(
         None => RoomMatches::default(),
     };
 
+    if let Some(recorded) = recorded(snapshot, &asked, &adapter, view.as_ref())? {
+        return Ok(recorded);
+    }
+
     // Then retrieve similar frames. Without them, keypoints still answer.
     let retrieved = retrieved(snapshot, &rooms, &adapter, view, image.as_ref());
     let retrieved = match retrieved.and_then(|source| source.similar_frames(k as usize, cancel)) {
@@ -110,6 +161,8 @@ fn answer(
     let searched = served.map(|served| served.navigator.room().id());
     let searched: BTreeSet<&RoomId> = searched.chain(matches.rooms()).collect();
     response.room_count = searched.len() as u32;
+    let mut served = retrieved.iter().flat_map(|retrieved| &retrieved.served);
+    response.exact = served.all(|served| served.navigator.audit().is_none());
 
     fill_pose(&mut response, matches, retrieved.as_ref())?;
     if response.method() != pb::LocalizationMethod::MatchedKeypoints
@@ -119,6 +172,42 @@ fn answer(
         response.reason = not_tried(snapshot, &asked);
     }
     Ok(response)
+}
+
+/// The answer for a stored frame of a room without an adapter; `None` for any other request.
+///
+/// # Errors
+/// [`Error::NotFound`] if the room has no such frame, [`Error::Precondition`] if it cannot be
+/// loaded.
+fn recorded(
+    snapshot: &Snapshot,
+    asked: &[Arc<ServedRoom>],
+    adapter: &str,
+    view: Option<&pb::View>,
+) -> Result<Option<pb::LocalizeResponse>, Error> {
+    let view = view.and_then(|view| view.view.as_ref());
+    let (Some(pb::view::View::FrameId(frame)), [served], "") = (view, asked, adapter) else {
+        return Ok(None);
+    };
+    if !snapshot.adapters_of(served).is_empty() {
+        return Ok(None);
+    }
+
+    let room = &served.load()?.room;
+    let unknown = |_| Error::no_frame("view.frame_id", FrameId(*frame), room.frame_count());
+    let pose = room.pose(FrameId(*frame)).map_err(unknown)?;
+    let mut response = pb::LocalizeResponse {
+        pose: Some(pb::PoseWithCovariance {
+            pose: Some(convert::pose_to_wire(pose, room.id().as_str())),
+            covariance: Vec::new(),
+        }),
+        room: Some(convert::served_revision(served)),
+        room_count: 1,
+        exact: true,
+        ..Default::default()
+    };
+    response.set_method(pb::LocalizationMethod::Recorded);
+    Ok(Some(response))
 }
 
 /// The rooms of a request, or all rooms if it names none.
@@ -193,9 +282,9 @@ impl ComparedView {
         let start = served[0].navigator.start(&source, None);
         let start = start.map_err(|error| match error {
             E::Adapter(problem) => view_error(&problem).within("view"),
-            E::SourceFrame(room::Error::UnknownFrame { frame, .. }) => {
-                Error::no_frame("view.frame_id", frame)
-            }
+            E::SourceFrame(room::Error::UnknownFrame {
+                frame, frame_count, ..
+            }) => Error::no_frame("view.frame_id", frame, frame_count),
             other => Error::from(other),
         })?;
 

@@ -3,10 +3,10 @@
 use tonic::{Request, Response, Status};
 
 use super::convert;
-use super::cost::{frame_bytes, step_bytes, step_count};
+use super::cost::{check_batch, check_batch_pixels, frame_bytes, step_bytes, step_count};
 use super::memory::hold_for_answer;
 use super::snapshot::ServedNavigator;
-use super::workers::{Lane, image_count, images_of};
+use super::workers::Lane;
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::navigation_service_server::NavigationService;
@@ -53,52 +53,14 @@ impl NavigationService for Handlers {
             request,
             |_, _| Lane::Long,
             move |snapshot, request, cancel| {
-                check_batch(&request.requests, most, limits)?;
-                check_batch_pixels(snapshot, &request.requests)?;
+                check_batch(request.requests.iter().map(frames_requested), most, limits)?;
+                let sources = request.requests.iter();
+                let sources = sources.filter_map(|request| request.source.as_ref());
+                check_batch_pixels(snapshot, sources)?;
                 answer_batch(snapshot, request, limits, cancel)
             },
         )
         .await
-    }
-}
-
-fn check_batch(requests: &[pb::NavigateRequest], most: usize, limits: Limits) -> Result<(), Error> {
-    if requests.is_empty() || requests.len() > most {
-        return Err(Error::invalid(
-            "requests",
-            format!("needs 1 to {most}, got {}", requests.len()),
-        ));
-    }
-
-    // The limit on retrieved frames bounds the size of the answer, so it applies to the whole
-    // batch.
-    let in_all = requests
-        .iter()
-        .map(frames_requested)
-        .fold(0, u64::saturating_add);
-
-    if in_all > limits.frames_in_answer {
-        let problem = format!(
-            "ask for {in_all} frames together, over the limit of {}",
-            limits.frames_in_answer
-        );
-        return Err(Error::invalid("requests", problem));
-    }
-    Ok(())
-}
-
-/// Checks the number of pixels of a batch's images. The limit is the same for all adapters.
-fn check_batch_pixels(snapshot: &Snapshot, requests: &[pb::NavigateRequest]) -> Result<(), Error> {
-    let sources = || {
-        requests
-            .iter()
-            .filter_map(|request| request.source.as_ref())
-    };
-    match snapshot.any_image_encoder() {
-        Some(encoder) if image_count(sources()) > 0 => {
-            encoder.check_pixels("requests", images_of(sources()))
-        }
-        _ => Ok(()),
     }
 }
 
@@ -171,9 +133,7 @@ fn navigate(
         step_mode: convert::mode_to_wire(query.mode).into(),
         inverse_variant: convert::variant_to_wire(query.step).into(),
         navigator: convert::navigator_to_wire(&query),
-        displacement: answer
-            .displacement
-            .map(|twist| convert::twist_to_wire(&twist)),
+        motion: answer.motion.map(|twist| convert::twist_to_wire(&twist)),
         exact: served.navigator.audit().is_none(),
     })
 }

@@ -4,7 +4,7 @@
 use ndarray::Array1;
 use tonic::{Request, Response, Status};
 
-use super::convert;
+use super::convert::{self, ImageCamera};
 use super::embedding::RequestAdapter;
 use super::two_views;
 use super::workers::Lane;
@@ -141,7 +141,13 @@ fn by_two_views(
     cancel: &Cancellation,
 ) -> Result<Option<pb::EstimateMotionResponse>, Error> {
     // Check a given camera for both estimators.
-    let stated = request.camera.as_ref().map(convert::camera).transpose()?;
+    let stated = request.camera.as_ref();
+    let stated = stated.map(|camera| convert::image_camera("camera", camera));
+    let stated = stated.transpose()?;
+    if matches!(stated, Some(ImageCamera::Mapping)) && request.room.is_empty() {
+        let problem = "needs room, which states whose mapping camera it is";
+        return Err(Error::invalid("camera.mapping_camera", problem));
+    }
 
     let served = match request.room.as_str() {
         "" => None,
@@ -157,6 +163,14 @@ fn by_two_views(
     };
 
     let of_room = served.and_then(|served| served.summary.provenance.camera);
+    let stated = match stated {
+        Some(ImageCamera::Stated(camera)) => Some(camera),
+        Some(ImageCamera::Mapping) if of_room.is_none() => {
+            let problem = "is not known: the room states no camera; state the intrinsics";
+            return Err(Error::invalid("camera.mapping_camera", problem));
+        }
+        Some(ImageCamera::Mapping) | None => None,
+    };
     let Some(camera) = stated.or(of_room) else {
         if request.room.is_empty() && snapshot.adapters().is_empty() {
             return Err(Error::invalid(

@@ -165,7 +165,7 @@ fn checked(
         adapter_revision: _,
         source,
         source_pose,
-        source_camera,
+        camera,
         goal,
         max_hop_length,
         tolerance_m,
@@ -180,6 +180,20 @@ fn checked(
 
     let planner = pb::Planner::try_from(planner)
         .map_err(|_| Error::invalid("planner", format!("has no value {planner}")))?;
+    let of_other_planner = match planner {
+        pb::Planner::Latent => {
+            min_arrival_probability.map(|_| ("min_arrival_probability", "PLANNER_POSE_GRAPH"))
+        }
+        pb::Planner::PoseGraph | pb::Planner::Unspecified => {
+            max_recoveries.map(|_| ("max_recoveries", "PLANNER_LATENT"))
+        }
+    };
+    if let Some((field, planner)) = of_other_planner {
+        return Err(Error::invalid(
+            field,
+            format!("only counts with {planner}; leave it out"),
+        ));
+    }
 
     let adapter = convert::stated_adapter(&adapter, &source)?;
     let served = snapshot.navigator(&room, adapter)?;
@@ -189,7 +203,7 @@ fn checked(
         StatedSource {
             view: source,
             pose: source_pose,
-            camera: source_camera,
+            camera,
         },
     )?;
     let navigator = &served.navigator;
@@ -301,7 +315,7 @@ impl MatchedSource {
 
         let fields = ViewFields {
             view: "source",
-            camera: "source_camera",
+            camera: "camera",
         };
         let room = snapshot.room(served.navigator.room().id().as_str())?;
         let room = std::slice::from_ref(room);
@@ -361,7 +375,8 @@ fn least_probability(given: Option<f64>) -> Result<f64, Error> {
 fn goal_pose(goal: Option<Goal>, navigator: &Navigator, room: &str) -> Result<Pose, Error> {
     match goal {
         Some(Goal::GoalFrameId(frame)) => {
-            let unknown = |_| Error::no_frame("goal_frame_id", FrameId(frame));
+            let frame_count = navigator.room().frame_count();
+            let unknown = |_| Error::no_frame("goal_frame_id", FrameId(frame), frame_count);
             Ok(*navigator.room().pose(FrameId(frame)).map_err(unknown)?)
         }
         Some(Goal::GoalPose(pose)) => {

@@ -202,35 +202,60 @@ impl StatesRevisions for pb::TrackConfig {
 
 impl StatesRevisions for pb::BatchNavigateRequest {
     fn stated_revisions(&self) -> Result<StatedRevisions, Error> {
-        let mut all = StatedRevisions {
-            room_field: "requests",
-            ..StatedRevisions::default()
-        };
-        for (position, request) in self.requests.iter().enumerate() {
-            let stated = request
-                .stated_revisions()
-                .map_err(|error| error.within(&format!("requests[{position}]")))?;
-            if !stated.is_empty() {
-                all.add(stated)?;
-            }
-        }
-        // A request without a revision would be answered from that of another one.
-        for request in &self.requests {
-            let of_room = all.room_revisions.get(&request.room).copied();
-            let of_adapter = all
-                .adapter
-                .as_ref()
-                .filter(|(name, _)| *name == request.adapter);
-            if of_room != request.room_revision
-                || of_adapter.map(|(_, revision)| *revision) != request.adapter_revision
-            {
-                return Err(Error::invalid(
-                    "requests",
-                    "state a revision of a room or an adapter that another request names without it; send them \
-                     in different batches",
-                ));
-            }
-        }
-        Ok(all)
+        of_batch(&self.requests, |request| &request.adapter)
     }
+}
+
+impl StatesRevisions for pb::BatchLocalizeRequest {
+    fn stated_revisions(&self) -> Result<StatedRevisions, Error> {
+        of_batch(&self.requests, |request| &request.adapter)
+    }
+}
+
+/// The revisions that the requests of a batch state. `adapter` is the name of a request's adapter.
+///
+/// # Errors
+/// [`Error::Invalid`] if a request states invalid revisions, or two requests disagree.
+fn of_batch<R: StatesRevisions>(
+    requests: &[R],
+    adapter: impl Fn(&R) -> &str,
+) -> Result<StatedRevisions, Error> {
+    let mut all = StatedRevisions {
+        room_field: "requests",
+        ..StatedRevisions::default()
+    };
+    let mut each = Vec::new();
+    for (position, request) in requests.iter().enumerate() {
+        let stated = request.stated_revisions();
+        let stated = stated.map_err(|error| error.within(&format!("requests[{position}]")))?;
+        if !stated.is_empty() {
+            all.add(stated.clone())?;
+        }
+        each.push(stated);
+    }
+
+    // A request without a revision would be answered from that of another one.
+    let is_pinned = |(request, stated): (&R, &StatedRevisions)| {
+        let names = |room: &String| stated.rooms.is_empty() || stated.rooms.contains(room);
+        let mut rooms = all.room_revisions.iter().filter(|(room, _)| names(room));
+        let has_rooms =
+            rooms.all(|(room, revision)| stated.room_revisions.get(room) == Some(revision));
+        let of_adapter = all.adapter.as_ref();
+        let of_adapter = of_adapter.filter(|(name, _)| name == adapter(request));
+        has_rooms && (of_adapter.is_none() || of_adapter == stated.adapter.as_ref())
+    };
+    if !all.is_empty() && !requests.iter().zip(&each).all(is_pinned) {
+        return Err(Error::invalid(
+            "requests",
+            "state a revision of a room or an adapter that another request names without it; send them \
+             in different batches",
+        ));
+    }
+
+    // No names stand for all rooms.
+    let mut stating = each.iter().filter(|stated| !stated.is_empty());
+    if stating.any(|stated| stated.rooms.is_empty()) {
+        all.rooms.clear();
+    }
+    Ok(all)
 }

@@ -77,6 +77,25 @@ pub enum Full {
     CallersChanges,
 }
 
+/// A resource that is not there, or that should not be (`google.rpc.ResourceInfo`).
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Missing {
+    /// Its kind: room, adapter, revision or frame.
+    pub kind: &'static str,
+    /// Its name.
+    pub name: String,
+}
+
+impl Missing {
+    /// A resource of this kind and name.
+    pub fn of(kind: &'static str, name: impl Into<String>) -> Self {
+        Self {
+            kind,
+            name: name.into(),
+        }
+    }
+}
+
 /// An error of a request. Its name is the reason in `google.rpc.ErrorInfo`.
 #[derive(Debug, Clone, thiserror::Error, PartialEq, IntoStaticStr)]
 #[strum(serialize_all = "SCREAMING_SNAKE_CASE")]
@@ -85,16 +104,19 @@ pub enum Error {
     #[error("{field}: {problem}")]
     #[strum(serialize = "INVALID_FIELD")]
     Invalid { field: String, problem: String },
-    #[error("{field}: '{name}' is not served{}", meant(nearest.as_ref()))]
+    #[error("{field}: {problem}")]
     #[strum(serialize = "NOT_SERVED")]
     NotFound {
         field: String,
-        name: String,
-        /// The most similar served name, if one is similar enough to suggest.
-        nearest: Option<String>,
+        missing: Missing,
+        problem: String,
     },
-    #[error("{field}: '{name}' is not in the store")]
-    NotStored { field: String, name: String },
+    #[error("{field}: {problem}")]
+    NotStored {
+        field: String,
+        missing: Missing,
+        problem: String,
+    },
     #[error("{0}")]
     Precondition(String),
     #[error("the server is not ready: it is loading its store or stopping; try again")]
@@ -103,9 +125,13 @@ pub enum Error {
     #[error("the server is busy: the limit of {what} is reached; try again later")]
     #[strum(serialize = "BUSY")]
     Full { what: Full },
-    #[error("{problem}")]
+    #[error("{field}: {problem}")]
     #[strum(serialize = "ALREADY_EXISTS")]
-    Exists { field: String, problem: String },
+    Exists {
+        field: String,
+        there: Missing,
+        problem: String,
+    },
     #[error("{problem}")]
     Quota { problem: String },
     #[error("this server has no such RPC")]
@@ -151,28 +177,43 @@ impl Error {
             .filter(|(likeness, _)| *likeness >= NEARLY)
             .max_by(|a, b| a.0.total_cmp(&b.0));
 
+        let kind = if field.contains("adapter") {
+            "adapter"
+        } else {
+            "room"
+        };
+        let remedy = match (name.split_once('/'), nearest) {
+            (Some(("rooms" | "adapters", own)), _) => format!("; send the name alone, '{own}'"),
+            (_, Some((_, nearest))) => format!("; did you mean '{nearest}'?"),
+            (_, None) => String::new(),
+        };
         Self::NotFound {
             field: field.to_owned(),
-            name: name.to_owned(),
-            nearest: nearest.map(|(_, name)| name.clone()),
+            missing: Missing::of(kind, name),
+            problem: format!("'{name}' is not served{remedy}"),
         }
     }
 
     /// An error for a frame that the room does not have.
-    pub fn no_frame(field: &str, frame: FrameId) -> Self {
+    pub fn no_frame(field: &str, frame: FrameId, frame_count: usize) -> Self {
+        let last = frame_count.saturating_sub(1);
         Self::NotFound {
             field: field.to_owned(),
-            name: frame.to_string(),
-            nearest: None,
+            missing: Missing::of("frame", frame.to_string()),
+            problem: format!("the room has no frame {frame}; its frames are 0 to {last}"),
         }
     }
 
     /// An error for a revision that the store does not have.
     pub fn no_revision(field: &str, name: &str, revision: u64) -> Self {
+        let remedy = match revision {
+            0 => "; revisions are counted from 1",
+            _ => "",
+        };
         Self::NotFound {
             field: field.to_owned(),
-            name: format!("{name}' revision '{revision}"),
-            nearest: None,
+            missing: Missing::of("revision", format!("{name}/revisions/{revision}")),
+            problem: format!("'{name}' has no revision {revision}{remedy}"),
         }
     }
 
@@ -185,12 +226,12 @@ impl Error {
             },
             Self::NotFound {
                 field,
-                name,
-                nearest,
+                missing,
+                problem,
             } => Self::NotFound {
                 field: format!("{parent}.{field}"),
-                name,
-                nearest,
+                missing,
+                problem,
             },
             other => other,
         }
@@ -204,13 +245,11 @@ impl Error {
                 problem,
             },
             Self::NotFound {
-                name: missing,
-                nearest,
-                ..
+                missing, problem, ..
             } => Self::NotFound {
                 field: name.to_owned(),
-                name: missing,
-                nearest,
+                missing,
+                problem,
             },
             other => other,
         }
@@ -235,10 +274,6 @@ impl Error {
             Self::Internal => Code::Internal,
         }
     }
-}
-
-fn meant(nearest: Option<&String>) -> String {
-    nearest.map_or_else(String::new, |name| format!("; did you mean '{name}'?"))
 }
 
 impl From<Error> for tonic_types::Status {
@@ -271,14 +306,23 @@ impl From<Error> for Status {
             Error::Invalid { field, problem } => {
                 details.add_bad_request_violation(brief(field), brief(problem));
             }
-            Error::NotFound { field, name, .. } => {
-                details.set_resource_info(brief(field), brief(name), "", "is not served");
+            Error::NotFound {
+                field,
+                missing: Missing { kind, name },
+                problem,
             }
-            Error::NotStored { field, name } => {
-                details.set_resource_info(brief(field), brief(name), "", "is not in the store");
+            | Error::NotStored {
+                field,
+                missing: Missing { kind, name },
+                problem,
             }
-            Error::Exists { field, problem } => {
-                details.set_resource_info(brief(field), "", "", brief(problem));
+            | Error::Exists {
+                field,
+                there: Missing { kind, name },
+                problem,
+            } => {
+                details.add_bad_request_violation(brief(field), brief(problem));
+                details.set_resource_info(*kind, brief(name), "", brief(problem));
             }
             Error::Full { .. } => {
                 details.set_retry_info(Some(std::time::Duration::from_millis(500)));
@@ -321,23 +365,27 @@ impl From<navigation::Error> for Error {
         // The field that the caller has to change. Errors that no change of the request can fix
         // return early.
         let field = match &error {
-            E::SourceFrame(room::Error::UnknownFrame { frame, .. }) => {
-                return Self::no_frame("source.frame_id", *frame);
+            E::SourceFrame(room::Error::UnknownFrame {
+                frame, frame_count, ..
+            }) => {
+                return Self::no_frame("source.frame_id", *frame, *frame_count);
             }
-            E::TargetFrame(room::Error::UnknownFrame { frame, .. }) => {
-                return Self::no_frame("displacement.target_frame_id", *frame);
+            E::TargetFrame(room::Error::UnknownFrame {
+                frame, frame_count, ..
+            }) => {
+                return Self::no_frame("motion.target_frame_id", *frame, *frame_count);
             }
             E::Cancelled(_) => return Self::Cancelled,
             // Features were checked when the store was loaded, so a mismatch here is internal.
             E::FeatureRows { .. } | E::Features(_) => return Self::Internal,
             E::SourceFrame(_) => "source.frame_id",
-            E::TargetFrame(_) => "displacement.target_frame_id",
+            E::TargetFrame(_) => "motion.target_frame_id",
             E::Adapter(problem) if lacks_method(problem) => "navigator",
             E::Adapter(problem) => return view_error(problem).within("source"),
             E::Refit(_) | E::Pairs(_) => return Self::Precondition(error.to_string()),
             E::Steps { .. } => "steps",
             E::TopK { .. } | E::FramesInAnswer { .. } => "top_k",
-            E::NoTwist | E::TwistNotFinite { .. } | E::TwistBeyondPi { .. } => "displacement",
+            E::NoTwist | E::TwistNotFinite { .. } | E::TwistBeyondPi { .. } => "motion",
             E::PoseNeeded { .. } => "source_pose",
             E::NoCandidates { .. } => "exclude_radius",
         };
@@ -365,7 +413,7 @@ pub fn view_error(error: &adapter::Error) -> Error {
         | E::LatentRange { .. }
         | E::Gate { .. }
         | E::NotFinite { what: "latent", .. } => "latent.values",
-        E::FeatureSource { .. } => "feature.source_name",
+        E::FeatureSource { .. } => "feature.feature_set",
         _ => "feature.values",
     };
 
@@ -428,11 +476,12 @@ mod tests {
         let name = || "a".to_owned();
         let errors = [
             (Error::invalid("a", "b"), "INVALID_ARGUMENT"),
-            (Error::no_frame("a", FrameId(0)), "NOT_FOUND"),
+            (Error::no_frame("a", FrameId(0), 1), "NOT_FOUND"),
             (
                 Error::NotStored {
                     field: name(),
-                    name: name(),
+                    missing: Missing::of("room", "a"),
+                    problem: name(),
                 },
                 "NOT_FOUND",
             ),
@@ -447,6 +496,7 @@ mod tests {
             (
                 Error::Exists {
                     field: name(),
+                    there: Missing::of("room", "a"),
                     problem: name(),
                 },
                 "ALREADY_EXISTS",
@@ -486,5 +536,9 @@ mod tests {
             "room: 'kitchn' is not served; did you mean 'kitchen'?"
         );
         assert_eq!(message("hallway"), "room: 'hallway' is not served");
+        assert_eq!(
+            message("rooms/office"),
+            "room: 'rooms/office' is not served; send the name alone, 'office'"
+        );
     }
 }

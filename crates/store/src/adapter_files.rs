@@ -150,7 +150,7 @@ pub(super) fn assembled(
 }
 
 /// Errors of reading weights from a file.
-enum WeightError {
+pub(super) enum WeightError {
     File(Error),
     Shape(adapter::Error),
 }
@@ -162,7 +162,7 @@ impl From<adapter::Error> for WeightError {
 }
 
 impl WeightError {
-    fn within(self, file: &str) -> Error {
+    pub(super) fn within(self, file: &str) -> Error {
         match self {
             Self::File(error) => error,
             Self::Shape(error) => Error::Damaged {
@@ -173,7 +173,10 @@ impl WeightError {
     }
 }
 
-fn read_weights(tensors: &TensorReader<'_>, name: &str) -> Result<Array2<f32>, WeightError> {
+pub(super) fn read_weights(
+    tensors: &TensorReader<'_>,
+    name: &str,
+) -> Result<Array2<f32>, WeightError> {
     tensors.f32(name).map_err(WeightError::File)
 }
 
@@ -402,7 +405,11 @@ fn matrix6(tensors: &TensorReader<'_>, name: &str, file: &str) -> Result<Matrix6
     Ok(Matrix6::from_fn(|row, column| array[(row, column)]))
 }
 
-fn vector6(tensors: &TensorReader<'_>, name: &str, file: &str) -> Result<Vector6<f64>, Error> {
+pub(super) fn vector6(
+    tensors: &TensorReader<'_>,
+    name: &str,
+    file: &str,
+) -> Result<Vector6<f64>, Error> {
     let array = tensors.f64(name)?;
     if array.dim() != (1, 6) {
         return Err(Error::Damaged {

@@ -271,7 +271,15 @@ impl Store {
                 self.check_exists(&ResourceName::room(room)).await?;
                 self.check_exists(&ResourceName::adapter(adapter)).await
             }
-            Choice::Nothing(_) | Choice::Cleared(_) => Ok(()),
+            Choice::Cleared(cleared) => {
+                // A default outlives what it names, so that it can be cleared.
+                let defaults = self.defaults().await?;
+                if defaults.with(choice) != defaults {
+                    return Ok(());
+                }
+                self.check_exists(&cleared.resource()).await
+            }
+            Choice::Nothing(_) => Ok(()),
         }
     }
 

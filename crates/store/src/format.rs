@@ -10,6 +10,7 @@ use seese3_core::adapter::{
 };
 use seese3_core::features::FeatureSource;
 use seese3_core::motion_scores::MotionScores;
+use seese3_core::recording_extent::RecordingExtent;
 use seese3_core::room::{Provenance, RoomId};
 use seese3_core::splits::{Split, StrideRange};
 use seese3_robot::pose_filter::FilterParameters;
@@ -37,6 +38,9 @@ pub struct RoomBody {
     /// Parameters of filters that track cameras in the room, if they were fitted to it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tracking: Option<FilterParameters>,
+    /// What the recording covers; absent in revisions of earlier programs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub extent: Option<RecordingExtent>,
     pub provenance: Provenance,
 }
 

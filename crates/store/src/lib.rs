@@ -55,12 +55,14 @@ mod room_fit;
 mod rooms;
 mod room_publishing;
 mod adapter_files;
+mod foreign_adapter;
 mod extension;
 mod map_edits;
 mod adapters;
 pub mod adapter_choice;
 
 pub use adapter_files::{check_adapter_files, stated_weights_size};
+pub use foreign_adapter::{ForeignAdapter, read_foreign_adapter};
 
 pub use contents::{Contents, RevisionContents, Usage};
 pub use defaults::{Choice, Cleared, Defaults, StandingDefaults};
@@ -95,6 +97,12 @@ use sha2::{Digest, Sha256};
 pub enum Error {
     #[error("store '{location}' cannot be opened: {problem}")]
     Open {
+        location: String,
+        #[source]
+        problem: Cause,
+    },
+    #[error("store '{location}' cannot be written: {problem}")]
+    ReadOnly {
         location: String,
         #[source]
         problem: Cause,
@@ -290,6 +298,24 @@ impl Store {
         }
 
         Self::open(location)
+    }
+
+    /// Checks that the store can be written, by an empty object that is removed again. For commands
+    /// that compute for minutes before they publish.
+    ///
+    /// # Errors
+    /// [`Error::ReadOnly`] if it cannot be written.
+    pub async fn check_writable(&self) -> Result<(), Error> {
+        let since = std::time::UNIX_EPOCH.elapsed().unwrap_or_default();
+        let probe = format!("probe-{}-{}", std::process::id(), since.as_nanos());
+        let probe = Path::from(probe);
+        let read_only = |error: object_store::Error| Error::ReadOnly {
+            location: self.location().to_owned(),
+            problem: error.into(),
+        };
+        let written = self.objects.put(&probe, PutPayload::new()).await;
+        written.map_err(read_only)?;
+        self.objects.delete(&probe).await.map_err(read_only)
     }
 
     /// Opens the store in an existing folder, or at an object-store URL.

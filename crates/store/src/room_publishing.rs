@@ -10,6 +10,7 @@ use super::room_keypoints::{KeypointsEntry, RoomKeypoints};
 use super::{ATTEMPTS, Error, Kind, Published, Store, folder_of, revision_path};
 use seese3_core::features::Features;
 use seese3_core::geometry::Pose;
+use seese3_core::recording_extent::RecordingExtent;
 use seese3_core::room::{Frames, Room, is_plain_name};
 use seese3_robot::pose_filter::FilterParameters;
 
@@ -69,16 +70,19 @@ fn room_body(room: &Room, objects: &RoomObjects, revision: u64) -> RoomBody {
         features: objects.features.clone(),
         keypoints: objects.keypoints.clone(),
         tracking: None,
+        extent: Some(RecordingExtent::of(room)),
         provenance: room.provenance().clone(),
     }
 }
 
-/// The newest revision, if it equals `body` except for the revision number and the date.
+/// The newest revision, if it equals `body` except for the revision number, the date and the extent,
+/// which follows from the frames.
 fn unchanged(folder: &Path, body: &RoomBody, newest: Option<RoomBody>) -> Option<Published> {
     let newest = newest?;
     let same = RoomBody {
         revision: newest.revision,
         created: newest.created.clone(),
+        extent: newest.extent,
         ..body.clone()
     };
 

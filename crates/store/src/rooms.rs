@@ -12,6 +12,7 @@ use seese3_core::adapter::TrainingRecord;
 use seese3_core::eval::TrainedOn;
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::keypoints::KeypointSource;
+use seese3_core::recording_extent::RecordingExtent;
 use seese3_core::room::{Provenance, Room, RoomId};
 use seese3_robot::pose_filter::FilterParameters;
 
@@ -56,6 +57,8 @@ pub struct RoomSummary {
     pub features: Vec<FeatureSource>,
     /// The source of the keypoints, if the room has any.
     pub keypoints: Option<KeypointSource>,
+    /// What the recording covers; `None` in revisions of earlier programs.
+    pub extent: Option<RecordingExtent>,
     /// Origin of the recording.
     pub provenance: Provenance,
 }
@@ -210,6 +213,7 @@ impl Store {
             frame_count: body.frame_count,
             features: sources.collect(),
             keypoints: body.keypoints.map(|entry| entry.header.source),
+            extent: body.extent,
             provenance: body.provenance,
         })
     }

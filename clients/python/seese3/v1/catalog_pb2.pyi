@@ -95,7 +95,7 @@ class ServerEncoder(_message.Message):
     def __init__(self, encoder: _Optional[str] = ..., adapters: _Optional[_Iterable[str]] = ..., detects_keypoints: _Optional[bool] = ...) -> None: ...
 
 class ServerLimits(_message.Message):
-    __slots__ = ("top_k", "steps", "batch", "predictions", "message_bytes", "duration_s", "image_pixels")
+    __slots__ = ("top_k", "steps", "batch", "predictions", "message_bytes", "duration_s", "image_pixels", "request_pixels", "answer_frames", "upload_bytes", "streams")
     TOP_K_FIELD_NUMBER: _ClassVar[int]
     STEPS_FIELD_NUMBER: _ClassVar[int]
     BATCH_FIELD_NUMBER: _ClassVar[int]
@@ -103,6 +103,10 @@ class ServerLimits(_message.Message):
     MESSAGE_BYTES_FIELD_NUMBER: _ClassVar[int]
     DURATION_S_FIELD_NUMBER: _ClassVar[int]
     IMAGE_PIXELS_FIELD_NUMBER: _ClassVar[int]
+    REQUEST_PIXELS_FIELD_NUMBER: _ClassVar[int]
+    ANSWER_FRAMES_FIELD_NUMBER: _ClassVar[int]
+    UPLOAD_BYTES_FIELD_NUMBER: _ClassVar[int]
+    STREAMS_FIELD_NUMBER: _ClassVar[int]
     top_k: int
     steps: int
     batch: int
@@ -110,7 +114,11 @@ class ServerLimits(_message.Message):
     message_bytes: int
     duration_s: float
     image_pixels: int
-    def __init__(self, top_k: _Optional[int] = ..., steps: _Optional[int] = ..., batch: _Optional[int] = ..., predictions: _Optional[int] = ..., message_bytes: _Optional[int] = ..., duration_s: _Optional[float] = ..., image_pixels: _Optional[int] = ...) -> None: ...
+    request_pixels: int
+    answer_frames: int
+    upload_bytes: int
+    streams: int
+    def __init__(self, top_k: _Optional[int] = ..., steps: _Optional[int] = ..., batch: _Optional[int] = ..., predictions: _Optional[int] = ..., message_bytes: _Optional[int] = ..., duration_s: _Optional[float] = ..., image_pixels: _Optional[int] = ..., request_pixels: _Optional[int] = ..., answer_frames: _Optional[int] = ..., upload_bytes: _Optional[int] = ..., streams: _Optional[int] = ...) -> None: ...
 
 class ListRoomsRequest(_message.Message):
     __slots__ = ("page_size", "page_token")
@@ -189,28 +197,56 @@ class GetRoomRequest(_message.Message):
     def __init__(self, room: _Optional[str] = ..., room_revision: _Optional[int] = ...) -> None: ...
 
 class Room(_message.Message):
-    __slots__ = ("name", "revision", "frame_count", "adapters", "features", "format", "license", "worst_rotation_deviation", "create_time", "camera")
+    __slots__ = ("name", "revision", "frame_count", "adapters", "feature_sources", "format", "license", "worst_rotation_error", "create_time", "camera", "extent", "duration_s", "frame_rate_hz", "has_keypoints", "expected_errors")
     NAME_FIELD_NUMBER: _ClassVar[int]
     REVISION_FIELD_NUMBER: _ClassVar[int]
     FRAME_COUNT_FIELD_NUMBER: _ClassVar[int]
     ADAPTERS_FIELD_NUMBER: _ClassVar[int]
-    FEATURES_FIELD_NUMBER: _ClassVar[int]
+    FEATURE_SOURCES_FIELD_NUMBER: _ClassVar[int]
     FORMAT_FIELD_NUMBER: _ClassVar[int]
     LICENSE_FIELD_NUMBER: _ClassVar[int]
-    WORST_ROTATION_DEVIATION_FIELD_NUMBER: _ClassVar[int]
+    WORST_ROTATION_ERROR_FIELD_NUMBER: _ClassVar[int]
     CREATE_TIME_FIELD_NUMBER: _ClassVar[int]
     CAMERA_FIELD_NUMBER: _ClassVar[int]
+    EXTENT_FIELD_NUMBER: _ClassVar[int]
+    DURATION_S_FIELD_NUMBER: _ClassVar[int]
+    FRAME_RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    HAS_KEYPOINTS_FIELD_NUMBER: _ClassVar[int]
+    EXPECTED_ERRORS_FIELD_NUMBER: _ClassVar[int]
     name: str
     revision: int
     frame_count: int
     adapters: _containers.RepeatedScalarFieldContainer[str]
-    features: _containers.RepeatedCompositeFieldContainer[FeatureSource]
+    feature_sources: _containers.RepeatedCompositeFieldContainer[FeatureSource]
     format: str
     license: str
-    worst_rotation_deviation: float
+    worst_rotation_error: float
     create_time: _timestamp_pb2.Timestamp
     camera: _geometry_pb2.CameraIntrinsics
-    def __init__(self, name: _Optional[str] = ..., revision: _Optional[int] = ..., frame_count: _Optional[int] = ..., adapters: _Optional[_Iterable[str]] = ..., features: _Optional[_Iterable[_Union[FeatureSource, _Mapping]]] = ..., format: _Optional[str] = ..., license: _Optional[str] = ..., worst_rotation_deviation: _Optional[float] = ..., create_time: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., camera: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ...) -> None: ...
+    extent: Extent
+    duration_s: float
+    frame_rate_hz: float
+    has_keypoints: bool
+    expected_errors: _containers.RepeatedCompositeFieldContainer[ExpectedError]
+    def __init__(self, name: _Optional[str] = ..., revision: _Optional[int] = ..., frame_count: _Optional[int] = ..., adapters: _Optional[_Iterable[str]] = ..., feature_sources: _Optional[_Iterable[_Union[FeatureSource, _Mapping]]] = ..., format: _Optional[str] = ..., license: _Optional[str] = ..., worst_rotation_error: _Optional[float] = ..., create_time: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., camera: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., extent: _Optional[_Union[Extent, _Mapping]] = ..., duration_s: _Optional[float] = ..., frame_rate_hz: _Optional[float] = ..., has_keypoints: _Optional[bool] = ..., expected_errors: _Optional[_Iterable[_Union[ExpectedError, _Mapping]]] = ...) -> None: ...
+
+class Extent(_message.Message):
+    __slots__ = ("min", "max")
+    MIN_FIELD_NUMBER: _ClassVar[int]
+    MAX_FIELD_NUMBER: _ClassVar[int]
+    min: _geometry_pb2.Vector3
+    max: _geometry_pb2.Vector3
+    def __init__(self, min: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., max: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ...) -> None: ...
+
+class ExpectedError(_message.Message):
+    __slots__ = ("feature_distance", "translation_m", "rotation_rad")
+    FEATURE_DISTANCE_FIELD_NUMBER: _ClassVar[int]
+    TRANSLATION_M_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_RAD_FIELD_NUMBER: _ClassVar[int]
+    feature_distance: float
+    translation_m: float
+    rotation_rad: float
+    def __init__(self, feature_distance: _Optional[float] = ..., translation_m: _Optional[float] = ..., rotation_rad: _Optional[float] = ...) -> None: ...
 
 class FeatureSource(_message.Message):
     __slots__ = ("name", "encoder", "layer", "pooling", "preprocess", "dim", "layer_index_base", "final_norm")
@@ -257,10 +293,10 @@ class GetAdapterRequest(_message.Message):
     def __init__(self, adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ...) -> None: ...
 
 class Adapter(_message.Message):
-    __slots__ = ("name", "revision", "source", "latent_dim", "training_rooms", "preset", "split", "stride", "seed", "test", "train", "train_mean_r2", "target_mean", "target_deviation", "singular_values", "create_time", "charts", "loss", "navigators", "mixing", "calibration_rooms")
+    __slots__ = ("name", "revision", "feature_source", "latent_dim", "training_rooms", "preset", "split", "stride", "seed", "test", "train", "train_mean_r2", "target_mean", "target_deviation", "singular_values", "create_time", "charts", "loss", "navigators", "mixing", "calibration_rooms")
     NAME_FIELD_NUMBER: _ClassVar[int]
     REVISION_FIELD_NUMBER: _ClassVar[int]
-    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    FEATURE_SOURCE_FIELD_NUMBER: _ClassVar[int]
     LATENT_DIM_FIELD_NUMBER: _ClassVar[int]
     TRAINING_ROOMS_FIELD_NUMBER: _ClassVar[int]
     PRESET_FIELD_NUMBER: _ClassVar[int]
@@ -281,7 +317,7 @@ class Adapter(_message.Message):
     CALIBRATION_ROOMS_FIELD_NUMBER: _ClassVar[int]
     name: str
     revision: int
-    source: FeatureSource
+    feature_source: FeatureSource
     latent_dim: int
     training_rooms: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Revision]
     preset: str
@@ -300,25 +336,25 @@ class Adapter(_message.Message):
     navigators: _containers.RepeatedScalarFieldContainer[str]
     mixing: ChartMixing
     calibration_rooms: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Revision]
-    def __init__(self, name: _Optional[str] = ..., revision: _Optional[int] = ..., source: _Optional[_Union[FeatureSource, _Mapping]] = ..., latent_dim: _Optional[int] = ..., training_rooms: _Optional[_Iterable[_Union[_geometry_pb2.Revision, _Mapping]]] = ..., preset: _Optional[str] = ..., split: _Optional[_Union[_geometry_pb2.Split, str]] = ..., stride: _Optional[int] = ..., seed: _Optional[int] = ..., test: _Optional[_Union[MotionScores, _Mapping]] = ..., train: _Optional[_Union[MotionScores, _Mapping]] = ..., train_mean_r2: _Optional[float] = ..., target_mean: _Optional[_Union[_geometry_pb2.Twist, _Mapping]] = ..., target_deviation: _Optional[_Union[_geometry_pb2.Twist, _Mapping]] = ..., singular_values: _Optional[_Iterable[float]] = ..., create_time: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., charts: _Optional[int] = ..., loss: _Optional[_Union[TrainingLoss, str]] = ..., navigators: _Optional[_Iterable[str]] = ..., mixing: _Optional[_Union[ChartMixing, str]] = ..., calibration_rooms: _Optional[_Iterable[_Union[_geometry_pb2.Revision, _Mapping]]] = ...) -> None: ...
+    def __init__(self, name: _Optional[str] = ..., revision: _Optional[int] = ..., feature_source: _Optional[_Union[FeatureSource, _Mapping]] = ..., latent_dim: _Optional[int] = ..., training_rooms: _Optional[_Iterable[_Union[_geometry_pb2.Revision, _Mapping]]] = ..., preset: _Optional[str] = ..., split: _Optional[_Union[_geometry_pb2.Split, str]] = ..., stride: _Optional[int] = ..., seed: _Optional[int] = ..., test: _Optional[_Union[MotionScores, _Mapping]] = ..., train: _Optional[_Union[MotionScores, _Mapping]] = ..., train_mean_r2: _Optional[float] = ..., target_mean: _Optional[_Union[_geometry_pb2.Twist, _Mapping]] = ..., target_deviation: _Optional[_Union[_geometry_pb2.Twist, _Mapping]] = ..., singular_values: _Optional[_Iterable[float]] = ..., create_time: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., charts: _Optional[int] = ..., loss: _Optional[_Union[TrainingLoss, str]] = ..., navigators: _Optional[_Iterable[str]] = ..., mixing: _Optional[_Union[ChartMixing, str]] = ..., calibration_rooms: _Optional[_Iterable[_Union[_geometry_pb2.Revision, _Mapping]]] = ...) -> None: ...
 
 class MotionScores(_message.Message):
-    __slots__ = ("n", "overall", "translation", "rotation", "direction", "magnitude", "still_components")
-    N_FIELD_NUMBER: _ClassVar[int]
+    __slots__ = ("pair_count", "overall", "translation", "rotation", "direction", "magnitude", "still_components")
+    PAIR_COUNT_FIELD_NUMBER: _ClassVar[int]
     OVERALL_FIELD_NUMBER: _ClassVar[int]
     TRANSLATION_FIELD_NUMBER: _ClassVar[int]
     ROTATION_FIELD_NUMBER: _ClassVar[int]
     DIRECTION_FIELD_NUMBER: _ClassVar[int]
     MAGNITUDE_FIELD_NUMBER: _ClassVar[int]
     STILL_COMPONENTS_FIELD_NUMBER: _ClassVar[int]
-    n: int
+    pair_count: int
     overall: float
     translation: float
     rotation: float
     direction: float
     magnitude: float
     still_components: int
-    def __init__(self, n: _Optional[int] = ..., overall: _Optional[float] = ..., translation: _Optional[float] = ..., rotation: _Optional[float] = ..., direction: _Optional[float] = ..., magnitude: _Optional[float] = ..., still_components: _Optional[int] = ...) -> None: ...
+    def __init__(self, pair_count: _Optional[int] = ..., overall: _Optional[float] = ..., translation: _Optional[float] = ..., rotation: _Optional[float] = ..., direction: _Optional[float] = ..., magnitude: _Optional[float] = ..., still_components: _Optional[int] = ...) -> None: ...
 
 class UploadRoomRequest(_message.Message):
     __slots__ = ("room", "frames", "end", "keypoints")
@@ -333,10 +369,10 @@ class UploadRoomRequest(_message.Message):
     def __init__(self, room: _Optional[_Union[RoomUpload, _Mapping]] = ..., frames: _Optional[_Union[FrameBatch, _Mapping]] = ..., end: _Optional[_Union[UploadEnd, _Mapping]] = ..., keypoints: _Optional[bytes] = ...) -> None: ...
 
 class RoomUpload(_message.Message):
-    __slots__ = ("room", "mode", "features", "encode_for", "format", "license", "camera", "request_id", "validate_only", "drop_other_features", "keypoints")
+    __slots__ = ("room", "mode", "feature_sources", "encode_for", "format", "license", "camera", "request_id", "validate_only", "drop_other_features", "keypoints")
     ROOM_FIELD_NUMBER: _ClassVar[int]
     MODE_FIELD_NUMBER: _ClassVar[int]
-    FEATURES_FIELD_NUMBER: _ClassVar[int]
+    FEATURE_SOURCES_FIELD_NUMBER: _ClassVar[int]
     ENCODE_FOR_FIELD_NUMBER: _ClassVar[int]
     FORMAT_FIELD_NUMBER: _ClassVar[int]
     LICENSE_FIELD_NUMBER: _ClassVar[int]
@@ -347,7 +383,7 @@ class RoomUpload(_message.Message):
     KEYPOINTS_FIELD_NUMBER: _ClassVar[int]
     room: str
     mode: UploadMode
-    features: _containers.RepeatedCompositeFieldContainer[FeatureSource]
+    feature_sources: _containers.RepeatedCompositeFieldContainer[FeatureSource]
     encode_for: str
     format: str
     license: str
@@ -356,11 +392,11 @@ class RoomUpload(_message.Message):
     validate_only: bool
     drop_other_features: bool
     keypoints: KeypointsUpload
-    def __init__(self, room: _Optional[str] = ..., mode: _Optional[_Union[UploadMode, str]] = ..., features: _Optional[_Iterable[_Union[FeatureSource, _Mapping]]] = ..., encode_for: _Optional[str] = ..., format: _Optional[str] = ..., license: _Optional[str] = ..., camera: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., request_id: _Optional[str] = ..., validate_only: _Optional[bool] = ..., drop_other_features: _Optional[bool] = ..., keypoints: _Optional[_Union[KeypointsUpload, _Mapping]] = ...) -> None: ...
+    def __init__(self, room: _Optional[str] = ..., mode: _Optional[_Union[UploadMode, str]] = ..., feature_sources: _Optional[_Iterable[_Union[FeatureSource, _Mapping]]] = ..., encode_for: _Optional[str] = ..., format: _Optional[str] = ..., license: _Optional[str] = ..., camera: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., request_id: _Optional[str] = ..., validate_only: _Optional[bool] = ..., drop_other_features: _Optional[bool] = ..., keypoints: _Optional[_Union[KeypointsUpload, _Mapping]] = ...) -> None: ...
 
 class KeypointsUpload(_message.Message):
-    __slots__ = ("features", "positions", "reliability", "descriptors", "unit_m", "epipolar_px", "design_effect", "gap_scale", "pose_noise", "relative_error")
-    FEATURES_FIELD_NUMBER: _ClassVar[int]
+    __slots__ = ("feature_set", "positions", "reliability", "descriptors", "unit_m", "epipolar_px", "design_effect", "gap_scale", "pose_noise", "relative_error")
+    FEATURE_SET_FIELD_NUMBER: _ClassVar[int]
     POSITIONS_FIELD_NUMBER: _ClassVar[int]
     RELIABILITY_FIELD_NUMBER: _ClassVar[int]
     DESCRIPTORS_FIELD_NUMBER: _ClassVar[int]
@@ -370,7 +406,7 @@ class KeypointsUpload(_message.Message):
     GAP_SCALE_FIELD_NUMBER: _ClassVar[int]
     POSE_NOISE_FIELD_NUMBER: _ClassVar[int]
     RELATIVE_ERROR_FIELD_NUMBER: _ClassVar[int]
-    features: str
+    feature_set: str
     positions: str
     reliability: str
     descriptors: str
@@ -380,7 +416,7 @@ class KeypointsUpload(_message.Message):
     gap_scale: float
     pose_noise: float
     relative_error: float
-    def __init__(self, features: _Optional[str] = ..., positions: _Optional[str] = ..., reliability: _Optional[str] = ..., descriptors: _Optional[str] = ..., unit_m: _Optional[float] = ..., epipolar_px: _Optional[float] = ..., design_effect: _Optional[float] = ..., gap_scale: _Optional[float] = ..., pose_noise: _Optional[float] = ..., relative_error: _Optional[float] = ...) -> None: ...
+    def __init__(self, feature_set: _Optional[str] = ..., positions: _Optional[str] = ..., reliability: _Optional[str] = ..., descriptors: _Optional[str] = ..., unit_m: _Optional[float] = ..., epipolar_px: _Optional[float] = ..., design_effect: _Optional[float] = ..., gap_scale: _Optional[float] = ..., pose_noise: _Optional[float] = ..., relative_error: _Optional[float] = ...) -> None: ...
 
 class FrameBatch(_message.Message):
     __slots__ = ("poses", "features", "images", "timestamps_ns", "frame_names", "segments")
@@ -416,6 +452,34 @@ class UploadRoomResponse(_message.Message):
     served: bool
     def __init__(self, revision: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., created: _Optional[bool] = ..., served: _Optional[bool] = ...) -> None: ...
 
+class DownloadRoomRequest(_message.Message):
+    __slots__ = ("room", "room_revision")
+    ROOM_FIELD_NUMBER: _ClassVar[int]
+    ROOM_REVISION_FIELD_NUMBER: _ClassVar[int]
+    room: str
+    room_revision: int
+    def __init__(self, room: _Optional[str] = ..., room_revision: _Optional[int] = ...) -> None: ...
+
+class DownloadRoomResponse(_message.Message):
+    __slots__ = ("room", "frames", "end", "keypoints")
+    ROOM_FIELD_NUMBER: _ClassVar[int]
+    FRAMES_FIELD_NUMBER: _ClassVar[int]
+    END_FIELD_NUMBER: _ClassVar[int]
+    KEYPOINTS_FIELD_NUMBER: _ClassVar[int]
+    room: RoomDownload
+    frames: FrameBatch
+    end: UploadEnd
+    keypoints: bytes
+    def __init__(self, room: _Optional[_Union[RoomDownload, _Mapping]] = ..., frames: _Optional[_Union[FrameBatch, _Mapping]] = ..., end: _Optional[_Union[UploadEnd, _Mapping]] = ..., keypoints: _Optional[bytes] = ...) -> None: ...
+
+class RoomDownload(_message.Message):
+    __slots__ = ("revision", "upload")
+    REVISION_FIELD_NUMBER: _ClassVar[int]
+    UPLOAD_FIELD_NUMBER: _ClassVar[int]
+    revision: _geometry_pb2.Revision
+    upload: RoomUpload
+    def __init__(self, revision: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., upload: _Optional[_Union[RoomUpload, _Mapping]] = ...) -> None: ...
+
 class UploadAdapterRequest(_message.Message):
     __slots__ = ("adapter", "weights")
     ADAPTER_FIELD_NUMBER: _ClassVar[int]
@@ -448,23 +512,47 @@ class UploadAdapterResponse(_message.Message):
     served: bool
     def __init__(self, revision: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., created: _Optional[bool] = ..., served: _Optional[bool] = ...) -> None: ...
 
+class DownloadAdapterRequest(_message.Message):
+    __slots__ = ("adapter", "adapter_revision")
+    ADAPTER_FIELD_NUMBER: _ClassVar[int]
+    ADAPTER_REVISION_FIELD_NUMBER: _ClassVar[int]
+    adapter: str
+    adapter_revision: int
+    def __init__(self, adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ...) -> None: ...
+
+class DownloadAdapterResponse(_message.Message):
+    __slots__ = ("adapter", "weights")
+    ADAPTER_FIELD_NUMBER: _ClassVar[int]
+    WEIGHTS_FIELD_NUMBER: _ClassVar[int]
+    adapter: AdapterDownload
+    weights: bytes
+    def __init__(self, adapter: _Optional[_Union[AdapterDownload, _Mapping]] = ..., weights: _Optional[bytes] = ...) -> None: ...
+
+class AdapterDownload(_message.Message):
+    __slots__ = ("revision", "manifest")
+    REVISION_FIELD_NUMBER: _ClassVar[int]
+    MANIFEST_FIELD_NUMBER: _ClassVar[int]
+    revision: _geometry_pb2.Revision
+    manifest: bytes
+    def __init__(self, revision: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., manifest: _Optional[bytes] = ...) -> None: ...
+
 class FitAdapterRequest(_message.Message):
-    __slots__ = ("room", "base_adapter", "features", "fitted_adapter", "seed", "request_id", "validate_only")
+    __slots__ = ("room", "base_adapter", "feature_set", "fitted_adapter", "seed", "request_id", "validate_only")
     ROOM_FIELD_NUMBER: _ClassVar[int]
     BASE_ADAPTER_FIELD_NUMBER: _ClassVar[int]
-    FEATURES_FIELD_NUMBER: _ClassVar[int]
+    FEATURE_SET_FIELD_NUMBER: _ClassVar[int]
     FITTED_ADAPTER_FIELD_NUMBER: _ClassVar[int]
     SEED_FIELD_NUMBER: _ClassVar[int]
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     VALIDATE_ONLY_FIELD_NUMBER: _ClassVar[int]
     room: str
     base_adapter: str
-    features: str
+    feature_set: str
     fitted_adapter: str
     seed: int
     request_id: str
     validate_only: bool
-    def __init__(self, room: _Optional[str] = ..., base_adapter: _Optional[str] = ..., features: _Optional[str] = ..., fitted_adapter: _Optional[str] = ..., seed: _Optional[int] = ..., request_id: _Optional[str] = ..., validate_only: _Optional[bool] = ...) -> None: ...
+    def __init__(self, room: _Optional[str] = ..., base_adapter: _Optional[str] = ..., feature_set: _Optional[str] = ..., fitted_adapter: _Optional[str] = ..., seed: _Optional[int] = ..., request_id: _Optional[str] = ..., validate_only: _Optional[bool] = ...) -> None: ...
 
 class FitAdapterResponse(_message.Message):
     __slots__ = ("progress", "result")
@@ -510,6 +598,16 @@ class RoomAdapter(_message.Message):
     adapter: str
     def __init__(self, room: _Optional[str] = ..., adapter: _Optional[str] = ...) -> None: ...
 
+class ListDefaultsRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class ListDefaultsResponse(_message.Message):
+    __slots__ = ("defaults",)
+    DEFAULTS_FIELD_NUMBER: _ClassVar[int]
+    defaults: _containers.RepeatedCompositeFieldContainer[CatalogDefault]
+    def __init__(self, defaults: _Optional[_Iterable[_Union[CatalogDefault, _Mapping]]] = ...) -> None: ...
+
 class SetDefaultRequest(_message.Message):
     __slots__ = ("default", "request_id", "validate_only")
     DEFAULT_FIELD_NUMBER: _ClassVar[int]
@@ -527,18 +625,18 @@ class SetDefaultResponse(_message.Message):
     def __init__(self, defaults: _Optional[_Iterable[_Union[CatalogDefault, _Mapping]]] = ...) -> None: ...
 
 class ClearDefaultRequest(_message.Message):
-    __slots__ = ("room_adapter", "room_revision", "adapter_revision", "request_id", "validate_only")
-    ROOM_ADAPTER_FIELD_NUMBER: _ClassVar[int]
-    ROOM_REVISION_FIELD_NUMBER: _ClassVar[int]
-    ADAPTER_REVISION_FIELD_NUMBER: _ClassVar[int]
+    __slots__ = ("adapter_of_room", "revision_of_room", "revision_of_adapter", "request_id", "validate_only")
+    ADAPTER_OF_ROOM_FIELD_NUMBER: _ClassVar[int]
+    REVISION_OF_ROOM_FIELD_NUMBER: _ClassVar[int]
+    REVISION_OF_ADAPTER_FIELD_NUMBER: _ClassVar[int]
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     VALIDATE_ONLY_FIELD_NUMBER: _ClassVar[int]
-    room_adapter: str
-    room_revision: str
-    adapter_revision: str
+    adapter_of_room: str
+    revision_of_room: str
+    revision_of_adapter: str
     request_id: str
     validate_only: bool
-    def __init__(self, room_adapter: _Optional[str] = ..., room_revision: _Optional[str] = ..., adapter_revision: _Optional[str] = ..., request_id: _Optional[str] = ..., validate_only: _Optional[bool] = ...) -> None: ...
+    def __init__(self, adapter_of_room: _Optional[str] = ..., revision_of_room: _Optional[str] = ..., revision_of_adapter: _Optional[str] = ..., request_id: _Optional[str] = ..., validate_only: _Optional[bool] = ...) -> None: ...
 
 class ClearDefaultResponse(_message.Message):
     __slots__ = ("defaults",)

@@ -9,10 +9,10 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class EvaluateRequest(_message.Message):
-    __slots__ = ("room", "adapter", "room_revision", "adapter_revision", "stride", "split", "navigators", "exclude_source", "exclude_radius", "thresholds", "seed", "steps", "step_mode")
+    __slots__ = ("room", "room_revision", "adapter", "adapter_revision", "stride", "split", "navigators", "exclude_source", "exclude_radius", "thresholds", "seed", "steps", "step_mode")
     ROOM_FIELD_NUMBER: _ClassVar[int]
-    ADAPTER_FIELD_NUMBER: _ClassVar[int]
     ROOM_REVISION_FIELD_NUMBER: _ClassVar[int]
+    ADAPTER_FIELD_NUMBER: _ClassVar[int]
     ADAPTER_REVISION_FIELD_NUMBER: _ClassVar[int]
     STRIDE_FIELD_NUMBER: _ClassVar[int]
     SPLIT_FIELD_NUMBER: _ClassVar[int]
@@ -24,8 +24,8 @@ class EvaluateRequest(_message.Message):
     STEPS_FIELD_NUMBER: _ClassVar[int]
     STEP_MODE_FIELD_NUMBER: _ClassVar[int]
     room: str
-    adapter: str
     room_revision: int
+    adapter: str
     adapter_revision: int
     stride: int
     split: _geometry_pb2.Split
@@ -36,7 +36,7 @@ class EvaluateRequest(_message.Message):
     seed: int
     steps: int
     step_mode: _navigation_pb2.StepMode
-    def __init__(self, room: _Optional[str] = ..., adapter: _Optional[str] = ..., room_revision: _Optional[int] = ..., adapter_revision: _Optional[int] = ..., stride: _Optional[int] = ..., split: _Optional[_Union[_geometry_pb2.Split, str]] = ..., navigators: _Optional[_Iterable[str]] = ..., exclude_source: _Optional[bool] = ..., exclude_radius: _Optional[int] = ..., thresholds: _Optional[_Iterable[float]] = ..., seed: _Optional[int] = ..., steps: _Optional[int] = ..., step_mode: _Optional[_Union[_navigation_pb2.StepMode, str]] = ...) -> None: ...
+    def __init__(self, room: _Optional[str] = ..., room_revision: _Optional[int] = ..., adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ..., stride: _Optional[int] = ..., split: _Optional[_Union[_geometry_pb2.Split, str]] = ..., navigators: _Optional[_Iterable[str]] = ..., exclude_source: _Optional[bool] = ..., exclude_radius: _Optional[int] = ..., thresholds: _Optional[_Iterable[float]] = ..., seed: _Optional[int] = ..., steps: _Optional[int] = ..., step_mode: _Optional[_Union[_navigation_pb2.StepMode, str]] = ...) -> None: ...
 
 class EvaluateResponse(_message.Message):
     __slots__ = ("progress", "report")
@@ -57,14 +57,16 @@ class EvaluationProgress(_message.Message):
     def __init__(self, done: _Optional[int] = ..., total: _Optional[int] = ..., navigator: _Optional[str] = ...) -> None: ...
 
 class EvaluationReport(_message.Message):
-    __slots__ = ("room", "adapter", "split", "stride", "n", "candidate_count", "source_excluded", "in_room", "leaks", "navigators", "steps", "step_mode", "calibrated_here")
+    __slots__ = ("room", "adapter", "split", "stride", "pair_count", "candidate_count", "exclude_source", "exclude_radius", "seed", "in_room", "leaks", "navigators", "steps", "step_mode", "calibrated_here")
     ROOM_FIELD_NUMBER: _ClassVar[int]
     ADAPTER_FIELD_NUMBER: _ClassVar[int]
     SPLIT_FIELD_NUMBER: _ClassVar[int]
     STRIDE_FIELD_NUMBER: _ClassVar[int]
-    N_FIELD_NUMBER: _ClassVar[int]
+    PAIR_COUNT_FIELD_NUMBER: _ClassVar[int]
     CANDIDATE_COUNT_FIELD_NUMBER: _ClassVar[int]
-    SOURCE_EXCLUDED_FIELD_NUMBER: _ClassVar[int]
+    EXCLUDE_SOURCE_FIELD_NUMBER: _ClassVar[int]
+    EXCLUDE_RADIUS_FIELD_NUMBER: _ClassVar[int]
+    SEED_FIELD_NUMBER: _ClassVar[int]
     IN_ROOM_FIELD_NUMBER: _ClassVar[int]
     LEAKS_FIELD_NUMBER: _ClassVar[int]
     NAVIGATORS_FIELD_NUMBER: _ClassVar[int]
@@ -75,21 +77,23 @@ class EvaluationReport(_message.Message):
     adapter: _geometry_pb2.Revision
     split: _geometry_pb2.Split
     stride: int
-    n: int
+    pair_count: int
     candidate_count: int
-    source_excluded: bool
+    exclude_source: bool
+    exclude_radius: int
+    seed: int
     in_room: bool
     leaks: bool
     navigators: _containers.RepeatedCompositeFieldContainer[NavigatorScores]
     steps: int
     step_mode: _navigation_pb2.StepMode
     calibrated_here: bool
-    def __init__(self, room: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., adapter: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., split: _Optional[_Union[_geometry_pb2.Split, str]] = ..., stride: _Optional[int] = ..., n: _Optional[int] = ..., candidate_count: _Optional[int] = ..., source_excluded: _Optional[bool] = ..., in_room: _Optional[bool] = ..., leaks: _Optional[bool] = ..., navigators: _Optional[_Iterable[_Union[NavigatorScores, _Mapping]]] = ..., steps: _Optional[int] = ..., step_mode: _Optional[_Union[_navigation_pb2.StepMode, str]] = ..., calibrated_here: _Optional[bool] = ...) -> None: ...
+    def __init__(self, room: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., adapter: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., split: _Optional[_Union[_geometry_pb2.Split, str]] = ..., stride: _Optional[int] = ..., pair_count: _Optional[int] = ..., candidate_count: _Optional[int] = ..., exclude_source: _Optional[bool] = ..., exclude_radius: _Optional[int] = ..., seed: _Optional[int] = ..., in_room: _Optional[bool] = ..., leaks: _Optional[bool] = ..., navigators: _Optional[_Iterable[_Union[NavigatorScores, _Mapping]]] = ..., steps: _Optional[int] = ..., step_mode: _Optional[_Union[_navigation_pb2.StepMode, str]] = ..., calibrated_here: _Optional[bool] = ...) -> None: ...
 
 class NavigatorScores(_message.Message):
-    __slots__ = ("name", "n", "latent_mse", "latent_r2", "top1", "hit_rates", "translation_m_median", "rotation_rad_median", "recalls", "leaks")
+    __slots__ = ("name", "pair_count", "latent_mse", "latent_r2", "top1", "hit_rates", "translation_m_median", "rotation_rad_median", "recalls", "leaks")
     NAME_FIELD_NUMBER: _ClassVar[int]
-    N_FIELD_NUMBER: _ClassVar[int]
+    PAIR_COUNT_FIELD_NUMBER: _ClassVar[int]
     LATENT_MSE_FIELD_NUMBER: _ClassVar[int]
     LATENT_R2_FIELD_NUMBER: _ClassVar[int]
     TOP1_FIELD_NUMBER: _ClassVar[int]
@@ -99,7 +103,7 @@ class NavigatorScores(_message.Message):
     RECALLS_FIELD_NUMBER: _ClassVar[int]
     LEAKS_FIELD_NUMBER: _ClassVar[int]
     name: str
-    n: int
+    pair_count: int
     latent_mse: float
     latent_r2: float
     top1: Proportion
@@ -108,7 +112,7 @@ class NavigatorScores(_message.Message):
     rotation_rad_median: float
     recalls: _containers.RepeatedCompositeFieldContainer[PoseRecall]
     leaks: bool
-    def __init__(self, name: _Optional[str] = ..., n: _Optional[int] = ..., latent_mse: _Optional[float] = ..., latent_r2: _Optional[float] = ..., top1: _Optional[_Union[Proportion, _Mapping]] = ..., hit_rates: _Optional[_Iterable[_Union[HitRate, _Mapping]]] = ..., translation_m_median: _Optional[float] = ..., rotation_rad_median: _Optional[float] = ..., recalls: _Optional[_Iterable[_Union[PoseRecall, _Mapping]]] = ..., leaks: _Optional[bool] = ...) -> None: ...
+    def __init__(self, name: _Optional[str] = ..., pair_count: _Optional[int] = ..., latent_mse: _Optional[float] = ..., latent_r2: _Optional[float] = ..., top1: _Optional[_Union[Proportion, _Mapping]] = ..., hit_rates: _Optional[_Iterable[_Union[HitRate, _Mapping]]] = ..., translation_m_median: _Optional[float] = ..., rotation_rad_median: _Optional[float] = ..., recalls: _Optional[_Iterable[_Union[PoseRecall, _Mapping]]] = ..., leaks: _Optional[bool] = ...) -> None: ...
 
 class Proportion(_message.Message):
     __slots__ = ("value", "low", "high")
@@ -129,56 +133,60 @@ class HitRate(_message.Message):
     def __init__(self, threshold: _Optional[float] = ..., proportion: _Optional[_Union[Proportion, _Mapping]] = ...) -> None: ...
 
 class PoseRecall(_message.Message):
-    __slots__ = ("translation_m", "rotation_deg", "proportion")
+    __slots__ = ("translation_m", "rotation_rad", "proportion")
     TRANSLATION_M_FIELD_NUMBER: _ClassVar[int]
-    ROTATION_DEG_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_RAD_FIELD_NUMBER: _ClassVar[int]
     PROPORTION_FIELD_NUMBER: _ClassVar[int]
     translation_m: float
-    rotation_deg: float
+    rotation_rad: float
     proportion: Proportion
-    def __init__(self, translation_m: _Optional[float] = ..., rotation_deg: _Optional[float] = ..., proportion: _Optional[_Union[Proportion, _Mapping]] = ...) -> None: ...
+    def __init__(self, translation_m: _Optional[float] = ..., rotation_rad: _Optional[float] = ..., proportion: _Optional[_Union[Proportion, _Mapping]] = ...) -> None: ...
 
 class ListPairsRequest(_message.Message):
-    __slots__ = ("room", "room_revision", "split", "stride", "adapter", "adapter_revision")
+    __slots__ = ("room", "room_revision", "adapter", "adapter_revision", "split", "stride")
     ROOM_FIELD_NUMBER: _ClassVar[int]
     ROOM_REVISION_FIELD_NUMBER: _ClassVar[int]
-    SPLIT_FIELD_NUMBER: _ClassVar[int]
-    STRIDE_FIELD_NUMBER: _ClassVar[int]
     ADAPTER_FIELD_NUMBER: _ClassVar[int]
     ADAPTER_REVISION_FIELD_NUMBER: _ClassVar[int]
+    SPLIT_FIELD_NUMBER: _ClassVar[int]
+    STRIDE_FIELD_NUMBER: _ClassVar[int]
     room: str
     room_revision: int
-    split: _geometry_pb2.Split
-    stride: int
     adapter: str
     adapter_revision: int
-    def __init__(self, room: _Optional[str] = ..., room_revision: _Optional[int] = ..., split: _Optional[_Union[_geometry_pb2.Split, str]] = ..., stride: _Optional[int] = ..., adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ...) -> None: ...
+    split: _geometry_pb2.Split
+    stride: int
+    def __init__(self, room: _Optional[str] = ..., room_revision: _Optional[int] = ..., adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ..., split: _Optional[_Union[_geometry_pb2.Split, str]] = ..., stride: _Optional[int] = ...) -> None: ...
+
+class FramePair(_message.Message):
+    __slots__ = ("source_frame_id", "target_frame_id")
+    SOURCE_FRAME_ID_FIELD_NUMBER: _ClassVar[int]
+    TARGET_FRAME_ID_FIELD_NUMBER: _ClassVar[int]
+    source_frame_id: int
+    target_frame_id: int
+    def __init__(self, source_frame_id: _Optional[int] = ..., target_frame_id: _Optional[int] = ...) -> None: ...
 
 class ListPairsResponse(_message.Message):
-    __slots__ = ("room", "split", "stride", "test_sources", "test_targets", "training_sources", "training_targets", "candidates")
+    __slots__ = ("room", "split", "stride", "test_pairs", "training_pairs", "candidate_frame_ids")
     ROOM_FIELD_NUMBER: _ClassVar[int]
     SPLIT_FIELD_NUMBER: _ClassVar[int]
     STRIDE_FIELD_NUMBER: _ClassVar[int]
-    TEST_SOURCES_FIELD_NUMBER: _ClassVar[int]
-    TEST_TARGETS_FIELD_NUMBER: _ClassVar[int]
-    TRAINING_SOURCES_FIELD_NUMBER: _ClassVar[int]
-    TRAINING_TARGETS_FIELD_NUMBER: _ClassVar[int]
-    CANDIDATES_FIELD_NUMBER: _ClassVar[int]
+    TEST_PAIRS_FIELD_NUMBER: _ClassVar[int]
+    TRAINING_PAIRS_FIELD_NUMBER: _ClassVar[int]
+    CANDIDATE_FRAME_IDS_FIELD_NUMBER: _ClassVar[int]
     room: _geometry_pb2.Revision
     split: _geometry_pb2.Split
     stride: int
-    test_sources: _containers.RepeatedScalarFieldContainer[int]
-    test_targets: _containers.RepeatedScalarFieldContainer[int]
-    training_sources: _containers.RepeatedScalarFieldContainer[int]
-    training_targets: _containers.RepeatedScalarFieldContainer[int]
-    candidates: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, room: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., split: _Optional[_Union[_geometry_pb2.Split, str]] = ..., stride: _Optional[int] = ..., test_sources: _Optional[_Iterable[int]] = ..., test_targets: _Optional[_Iterable[int]] = ..., training_sources: _Optional[_Iterable[int]] = ..., training_targets: _Optional[_Iterable[int]] = ..., candidates: _Optional[_Iterable[int]] = ...) -> None: ...
+    test_pairs: _containers.RepeatedCompositeFieldContainer[FramePair]
+    training_pairs: _containers.RepeatedCompositeFieldContainer[FramePair]
+    candidate_frame_ids: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, room: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., split: _Optional[_Union[_geometry_pb2.Split, str]] = ..., stride: _Optional[int] = ..., test_pairs: _Optional[_Iterable[_Union[FramePair, _Mapping]]] = ..., training_pairs: _Optional[_Iterable[_Union[FramePair, _Mapping]]] = ..., candidate_frame_ids: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class ScorePredictionsRequest(_message.Message):
-    __slots__ = ("room", "adapter", "room_revision", "adapter_revision", "predictions", "split", "exclude_source", "exclude_radius", "thresholds")
+    __slots__ = ("room", "room_revision", "adapter", "adapter_revision", "predictions", "split", "exclude_source", "exclude_radius", "thresholds")
     ROOM_FIELD_NUMBER: _ClassVar[int]
-    ADAPTER_FIELD_NUMBER: _ClassVar[int]
     ROOM_REVISION_FIELD_NUMBER: _ClassVar[int]
+    ADAPTER_FIELD_NUMBER: _ClassVar[int]
     ADAPTER_REVISION_FIELD_NUMBER: _ClassVar[int]
     PREDICTIONS_FIELD_NUMBER: _ClassVar[int]
     SPLIT_FIELD_NUMBER: _ClassVar[int]
@@ -186,15 +194,15 @@ class ScorePredictionsRequest(_message.Message):
     EXCLUDE_RADIUS_FIELD_NUMBER: _ClassVar[int]
     THRESHOLDS_FIELD_NUMBER: _ClassVar[int]
     room: str
-    adapter: str
     room_revision: int
+    adapter: str
     adapter_revision: int
     predictions: _containers.RepeatedCompositeFieldContainer[Prediction]
     split: _geometry_pb2.Split
     exclude_source: bool
     exclude_radius: int
     thresholds: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, room: _Optional[str] = ..., adapter: _Optional[str] = ..., room_revision: _Optional[int] = ..., adapter_revision: _Optional[int] = ..., predictions: _Optional[_Iterable[_Union[Prediction, _Mapping]]] = ..., split: _Optional[_Union[_geometry_pb2.Split, str]] = ..., exclude_source: _Optional[bool] = ..., exclude_radius: _Optional[int] = ..., thresholds: _Optional[_Iterable[float]] = ...) -> None: ...
+    def __init__(self, room: _Optional[str] = ..., room_revision: _Optional[int] = ..., adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ..., predictions: _Optional[_Iterable[_Union[Prediction, _Mapping]]] = ..., split: _Optional[_Union[_geometry_pb2.Split, str]] = ..., exclude_source: _Optional[bool] = ..., exclude_radius: _Optional[int] = ..., thresholds: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Prediction(_message.Message):
     __slots__ = ("source_frame_id", "target_frame_id", "latent", "retrieved_frame_id", "last_step_frame_id")

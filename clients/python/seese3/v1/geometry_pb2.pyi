@@ -100,12 +100,12 @@ class Twist(_message.Message):
     def __init__(self, linear: _Optional[_Union[Vector3, _Mapping]] = ..., angular: _Optional[_Union[Vector3, _Mapping]] = ...) -> None: ...
 
 class Feature(_message.Message):
-    __slots__ = ("values", "source_name")
+    __slots__ = ("values", "feature_set")
     VALUES_FIELD_NUMBER: _ClassVar[int]
-    SOURCE_NAME_FIELD_NUMBER: _ClassVar[int]
+    FEATURE_SET_FIELD_NUMBER: _ClassVar[int]
     values: _containers.RepeatedScalarFieldContainer[float]
-    source_name: str
-    def __init__(self, values: _Optional[_Iterable[float]] = ..., source_name: _Optional[str] = ...) -> None: ...
+    feature_set: str
+    def __init__(self, values: _Optional[_Iterable[float]] = ..., feature_set: _Optional[str] = ...) -> None: ...
 
 class Latent(_message.Message):
     __slots__ = ("values", "adapter")
@@ -184,5 +184,9 @@ class ViewCamera(_message.Message):
     INTRINSICS_FIELD_NUMBER: _ClassVar[int]
     MAPPING_CAMERA_FIELD_NUMBER: _ClassVar[int]
     intrinsics: CameraIntrinsics
-    mapping_camera: bool
-    def __init__(self, intrinsics: _Optional[_Union[CameraIntrinsics, _Mapping]] = ..., mapping_camera: _Optional[bool] = ...) -> None: ...
+    mapping_camera: MappingCamera
+    def __init__(self, intrinsics: _Optional[_Union[CameraIntrinsics, _Mapping]] = ..., mapping_camera: _Optional[_Union[MappingCamera, _Mapping]] = ...) -> None: ...
+
+class MappingCamera(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...

@@ -1,3 +1,4 @@
+from google.rpc import status_pb2 as _status_pb2
 from seese3.v1 import geometry_pb2 as _geometry_pb2
 from google.protobuf.internal import containers as _containers
 from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
@@ -60,7 +61,7 @@ class LocalizeRequest(_message.Message):
     def __init__(self, rooms: _Optional[_Iterable[str]] = ..., room_revisions: _Optional[_Mapping[str, int]] = ..., adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ..., view: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ..., top_k: _Optional[int] = ..., camera: _Optional[_Union[_geometry_pb2.ViewCamera, _Mapping]] = ...) -> None: ...
 
 class LocalizeResponse(_message.Message):
-    __slots__ = ("pose", "room", "novelty", "method", "reason", "matches", "fitted", "frames", "adapter", "room_count")
+    __slots__ = ("pose", "room", "novelty", "method", "reason", "matches", "fitted", "frames", "adapter", "room_count", "exact")
     POSE_FIELD_NUMBER: _ClassVar[int]
     ROOM_FIELD_NUMBER: _ClassVar[int]
     NOVELTY_FIELD_NUMBER: _ClassVar[int]
@@ -71,6 +72,7 @@ class LocalizeResponse(_message.Message):
     FRAMES_FIELD_NUMBER: _ClassVar[int]
     ADAPTER_FIELD_NUMBER: _ClassVar[int]
     ROOM_COUNT_FIELD_NUMBER: _ClassVar[int]
+    EXACT_FIELD_NUMBER: _ClassVar[int]
     pose: _geometry_pb2.PoseWithCovariance
     room: _geometry_pb2.Revision
     novelty: float
@@ -81,7 +83,28 @@ class LocalizeResponse(_message.Message):
     frames: _containers.RepeatedCompositeFieldContainer[SimilarFrame]
     adapter: _geometry_pb2.Revision
     room_count: int
-    def __init__(self, pose: _Optional[_Union[_geometry_pb2.PoseWithCovariance, _Mapping]] = ..., room: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., novelty: _Optional[float] = ..., method: _Optional[_Union[LocalizationMethod, str]] = ..., reason: _Optional[str] = ..., matches: _Optional[_Union[KeypointMatches, _Mapping]] = ..., fitted: _Optional[_Union[FittedEstimate, _Mapping]] = ..., frames: _Optional[_Iterable[_Union[SimilarFrame, _Mapping]]] = ..., adapter: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., room_count: _Optional[int] = ...) -> None: ...
+    exact: bool
+    def __init__(self, pose: _Optional[_Union[_geometry_pb2.PoseWithCovariance, _Mapping]] = ..., room: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., novelty: _Optional[float] = ..., method: _Optional[_Union[LocalizationMethod, str]] = ..., reason: _Optional[str] = ..., matches: _Optional[_Union[KeypointMatches, _Mapping]] = ..., fitted: _Optional[_Union[FittedEstimate, _Mapping]] = ..., frames: _Optional[_Iterable[_Union[SimilarFrame, _Mapping]]] = ..., adapter: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., room_count: _Optional[int] = ..., exact: _Optional[bool] = ...) -> None: ...
+
+class BatchLocalizeRequest(_message.Message):
+    __slots__ = ("requests",)
+    REQUESTS_FIELD_NUMBER: _ClassVar[int]
+    requests: _containers.RepeatedCompositeFieldContainer[LocalizeRequest]
+    def __init__(self, requests: _Optional[_Iterable[_Union[LocalizeRequest, _Mapping]]] = ...) -> None: ...
+
+class BatchLocalizeResponse(_message.Message):
+    __slots__ = ("results",)
+    RESULTS_FIELD_NUMBER: _ClassVar[int]
+    results: _containers.RepeatedCompositeFieldContainer[BatchLocalizeResult]
+    def __init__(self, results: _Optional[_Iterable[_Union[BatchLocalizeResult, _Mapping]]] = ...) -> None: ...
+
+class BatchLocalizeResult(_message.Message):
+    __slots__ = ("response", "error")
+    RESPONSE_FIELD_NUMBER: _ClassVar[int]
+    ERROR_FIELD_NUMBER: _ClassVar[int]
+    response: LocalizeResponse
+    error: _status_pb2.Status
+    def __init__(self, response: _Optional[_Union[LocalizeResponse, _Mapping]] = ..., error: _Optional[_Union[_status_pb2.Status, _Mapping]] = ...) -> None: ...
 
 class KeypointMatches(_message.Message):
     __slots__ = ("inliers", "keypoints", "frame_ids")

@@ -53,7 +53,7 @@ ROUTE_OUTCOME_START_UNKNOWN: RouteOutcome
 ROUTE_OUTCOME_GOAL_NOT_MAPPED: RouteOutcome
 ROUTE_OUTCOME_NO_ROUTE: RouteOutcome
 
-class Displacement(_message.Message):
+class RequestedMotion(_message.Message):
     __slots__ = ("twist", "target_frame_id", "target_pose", "twists")
     TWIST_FIELD_NUMBER: _ClassVar[int]
     TARGET_FRAME_ID_FIELD_NUMBER: _ClassVar[int]
@@ -72,45 +72,45 @@ class TwistList(_message.Message):
     def __init__(self, twists: _Optional[_Iterable[_Union[_geometry_pb2.Twist, _Mapping]]] = ...) -> None: ...
 
 class NavigateRequest(_message.Message):
-    __slots__ = ("room", "adapter", "source", "source_pose", "displacement", "steps", "step_mode", "inverse_variant", "top_k", "exclude_source", "exclude_radius", "room_revision", "adapter_revision", "navigator")
+    __slots__ = ("room", "room_revision", "adapter", "adapter_revision", "source", "source_pose", "motion", "steps", "step_mode", "inverse_variant", "top_k", "exclude_source", "exclude_radius", "navigator")
     ROOM_FIELD_NUMBER: _ClassVar[int]
+    ROOM_REVISION_FIELD_NUMBER: _ClassVar[int]
     ADAPTER_FIELD_NUMBER: _ClassVar[int]
+    ADAPTER_REVISION_FIELD_NUMBER: _ClassVar[int]
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     SOURCE_POSE_FIELD_NUMBER: _ClassVar[int]
-    DISPLACEMENT_FIELD_NUMBER: _ClassVar[int]
+    MOTION_FIELD_NUMBER: _ClassVar[int]
     STEPS_FIELD_NUMBER: _ClassVar[int]
     STEP_MODE_FIELD_NUMBER: _ClassVar[int]
     INVERSE_VARIANT_FIELD_NUMBER: _ClassVar[int]
     TOP_K_FIELD_NUMBER: _ClassVar[int]
     EXCLUDE_SOURCE_FIELD_NUMBER: _ClassVar[int]
     EXCLUDE_RADIUS_FIELD_NUMBER: _ClassVar[int]
-    ROOM_REVISION_FIELD_NUMBER: _ClassVar[int]
-    ADAPTER_REVISION_FIELD_NUMBER: _ClassVar[int]
     NAVIGATOR_FIELD_NUMBER: _ClassVar[int]
     room: str
+    room_revision: int
     adapter: str
+    adapter_revision: int
     source: _geometry_pb2.View
     source_pose: _geometry_pb2.Pose
-    displacement: Displacement
+    motion: RequestedMotion
     steps: int
     step_mode: StepMode
     inverse_variant: InverseVariant
     top_k: int
     exclude_source: bool
     exclude_radius: int
-    room_revision: int
-    adapter_revision: int
     navigator: str
-    def __init__(self, room: _Optional[str] = ..., adapter: _Optional[str] = ..., source: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ..., source_pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., displacement: _Optional[_Union[Displacement, _Mapping]] = ..., steps: _Optional[int] = ..., step_mode: _Optional[_Union[StepMode, str]] = ..., inverse_variant: _Optional[_Union[InverseVariant, str]] = ..., top_k: _Optional[int] = ..., exclude_source: _Optional[bool] = ..., exclude_radius: _Optional[int] = ..., room_revision: _Optional[int] = ..., adapter_revision: _Optional[int] = ..., navigator: _Optional[str] = ...) -> None: ...
+    def __init__(self, room: _Optional[str] = ..., room_revision: _Optional[int] = ..., adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ..., source: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ..., source_pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., motion: _Optional[_Union[RequestedMotion, _Mapping]] = ..., steps: _Optional[int] = ..., step_mode: _Optional[_Union[StepMode, str]] = ..., inverse_variant: _Optional[_Union[InverseVariant, str]] = ..., top_k: _Optional[int] = ..., exclude_source: _Optional[bool] = ..., exclude_radius: _Optional[int] = ..., navigator: _Optional[str] = ...) -> None: ...
 
 class NavigateResponse(_message.Message):
-    __slots__ = ("room", "adapter", "steps", "step_mode", "inverse_variant", "displacement", "exact", "navigator")
+    __slots__ = ("room", "adapter", "steps", "step_mode", "inverse_variant", "motion", "exact", "navigator")
     ROOM_FIELD_NUMBER: _ClassVar[int]
     ADAPTER_FIELD_NUMBER: _ClassVar[int]
     STEPS_FIELD_NUMBER: _ClassVar[int]
     STEP_MODE_FIELD_NUMBER: _ClassVar[int]
     INVERSE_VARIANT_FIELD_NUMBER: _ClassVar[int]
-    DISPLACEMENT_FIELD_NUMBER: _ClassVar[int]
+    MOTION_FIELD_NUMBER: _ClassVar[int]
     EXACT_FIELD_NUMBER: _ClassVar[int]
     NAVIGATOR_FIELD_NUMBER: _ClassVar[int]
     room: _geometry_pb2.Revision
@@ -118,10 +118,10 @@ class NavigateResponse(_message.Message):
     steps: _containers.RepeatedCompositeFieldContainer[NavigationStep]
     step_mode: StepMode
     inverse_variant: InverseVariant
-    displacement: _geometry_pb2.Twist
+    motion: _geometry_pb2.Twist
     exact: bool
     navigator: str
-    def __init__(self, room: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., adapter: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., steps: _Optional[_Iterable[_Union[NavigationStep, _Mapping]]] = ..., step_mode: _Optional[_Union[StepMode, str]] = ..., inverse_variant: _Optional[_Union[InverseVariant, str]] = ..., displacement: _Optional[_Union[_geometry_pb2.Twist, _Mapping]] = ..., exact: _Optional[bool] = ..., navigator: _Optional[str] = ...) -> None: ...
+    def __init__(self, room: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., adapter: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., steps: _Optional[_Iterable[_Union[NavigationStep, _Mapping]]] = ..., step_mode: _Optional[_Union[StepMode, str]] = ..., inverse_variant: _Optional[_Union[InverseVariant, str]] = ..., motion: _Optional[_Union[_geometry_pb2.Twist, _Mapping]] = ..., exact: _Optional[bool] = ..., navigator: _Optional[str] = ...) -> None: ...
 
 class NavigationStep(_message.Message):
     __slots__ = ("step", "frames", "requested_pose", "error", "latent")
@@ -158,14 +158,14 @@ class BatchNavigateResult(_message.Message):
     def __init__(self, response: _Optional[_Union[NavigateResponse, _Mapping]] = ..., error: _Optional[_Union[_status_pb2.Status, _Mapping]] = ...) -> None: ...
 
 class PlanRouteRequest(_message.Message):
-    __slots__ = ("room", "room_revision", "adapter", "adapter_revision", "source", "source_pose", "source_camera", "goal_frame_id", "goal_pose", "max_hop_length", "tolerance_m", "tolerance_rad", "max_hops", "max_recoveries", "planner", "min_arrival_probability")
+    __slots__ = ("room", "room_revision", "adapter", "adapter_revision", "source", "source_pose", "camera", "goal_frame_id", "goal_pose", "max_hop_length", "tolerance_m", "tolerance_rad", "max_hops", "max_recoveries", "planner", "min_arrival_probability")
     ROOM_FIELD_NUMBER: _ClassVar[int]
     ROOM_REVISION_FIELD_NUMBER: _ClassVar[int]
     ADAPTER_FIELD_NUMBER: _ClassVar[int]
     ADAPTER_REVISION_FIELD_NUMBER: _ClassVar[int]
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     SOURCE_POSE_FIELD_NUMBER: _ClassVar[int]
-    SOURCE_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_FIELD_NUMBER: _ClassVar[int]
     GOAL_FRAME_ID_FIELD_NUMBER: _ClassVar[int]
     GOAL_POSE_FIELD_NUMBER: _ClassVar[int]
     MAX_HOP_LENGTH_FIELD_NUMBER: _ClassVar[int]
@@ -181,7 +181,7 @@ class PlanRouteRequest(_message.Message):
     adapter_revision: int
     source: _geometry_pb2.View
     source_pose: _geometry_pb2.Pose
-    source_camera: _geometry_pb2.ViewCamera
+    camera: _geometry_pb2.ViewCamera
     goal_frame_id: int
     goal_pose: _geometry_pb2.Pose
     max_hop_length: float
@@ -191,7 +191,7 @@ class PlanRouteRequest(_message.Message):
     max_recoveries: int
     planner: Planner
     min_arrival_probability: float
-    def __init__(self, room: _Optional[str] = ..., room_revision: _Optional[int] = ..., adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ..., source: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ..., source_pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., source_camera: _Optional[_Union[_geometry_pb2.ViewCamera, _Mapping]] = ..., goal_frame_id: _Optional[int] = ..., goal_pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., max_hop_length: _Optional[float] = ..., tolerance_m: _Optional[float] = ..., tolerance_rad: _Optional[float] = ..., max_hops: _Optional[int] = ..., max_recoveries: _Optional[int] = ..., planner: _Optional[_Union[Planner, str]] = ..., min_arrival_probability: _Optional[float] = ...) -> None: ...
+    def __init__(self, room: _Optional[str] = ..., room_revision: _Optional[int] = ..., adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ..., source: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ..., source_pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., camera: _Optional[_Union[_geometry_pb2.ViewCamera, _Mapping]] = ..., goal_frame_id: _Optional[int] = ..., goal_pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., max_hop_length: _Optional[float] = ..., tolerance_m: _Optional[float] = ..., tolerance_rad: _Optional[float] = ..., max_hops: _Optional[int] = ..., max_recoveries: _Optional[int] = ..., planner: _Optional[_Union[Planner, str]] = ..., min_arrival_probability: _Optional[float] = ...) -> None: ...
 
 class Route(_message.Message):
     __slots__ = ("outcome", "message", "start", "hops", "needed_hop_length", "arrival_probability", "room", "adapter", "planning_time_ns")

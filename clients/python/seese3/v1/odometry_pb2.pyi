@@ -87,38 +87,38 @@ TRACK_REFUSAL_REASON_GRAVITY: TrackRefusalReason
 TRACK_REFUSAL_REASON_INERTIAL: TrackRefusalReason
 
 class EstimateMotionRequest(_message.Message):
-    __slots__ = ("adapter", "adapter_revision", "room_revision", "room", "first", "second", "camera")
+    __slots__ = ("room", "room_revision", "adapter", "adapter_revision", "first", "second", "camera")
+    ROOM_FIELD_NUMBER: _ClassVar[int]
+    ROOM_REVISION_FIELD_NUMBER: _ClassVar[int]
     ADAPTER_FIELD_NUMBER: _ClassVar[int]
     ADAPTER_REVISION_FIELD_NUMBER: _ClassVar[int]
-    ROOM_REVISION_FIELD_NUMBER: _ClassVar[int]
-    ROOM_FIELD_NUMBER: _ClassVar[int]
     FIRST_FIELD_NUMBER: _ClassVar[int]
     SECOND_FIELD_NUMBER: _ClassVar[int]
     CAMERA_FIELD_NUMBER: _ClassVar[int]
+    room: str
+    room_revision: int
     adapter: str
     adapter_revision: int
-    room_revision: int
-    room: str
     first: _geometry_pb2.View
     second: _geometry_pb2.View
-    camera: _geometry_pb2.CameraIntrinsics
-    def __init__(self, adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ..., room_revision: _Optional[int] = ..., room: _Optional[str] = ..., first: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ..., second: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ..., camera: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ...) -> None: ...
+    camera: _geometry_pb2.ViewCamera
+    def __init__(self, room: _Optional[str] = ..., room_revision: _Optional[int] = ..., adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ..., first: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ..., second: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ..., camera: _Optional[_Union[_geometry_pb2.ViewCamera, _Mapping]] = ...) -> None: ...
 
 class EncodeRequest(_message.Message):
-    __slots__ = ("adapter", "adapter_revision", "room_revision", "room", "views", "with_features")
+    __slots__ = ("room", "room_revision", "adapter", "adapter_revision", "views", "with_features")
+    ROOM_FIELD_NUMBER: _ClassVar[int]
+    ROOM_REVISION_FIELD_NUMBER: _ClassVar[int]
     ADAPTER_FIELD_NUMBER: _ClassVar[int]
     ADAPTER_REVISION_FIELD_NUMBER: _ClassVar[int]
-    ROOM_REVISION_FIELD_NUMBER: _ClassVar[int]
-    ROOM_FIELD_NUMBER: _ClassVar[int]
     VIEWS_FIELD_NUMBER: _ClassVar[int]
     WITH_FEATURES_FIELD_NUMBER: _ClassVar[int]
+    room: str
+    room_revision: int
     adapter: str
     adapter_revision: int
-    room_revision: int
-    room: str
     views: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.View]
     with_features: bool
-    def __init__(self, adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ..., room_revision: _Optional[int] = ..., room: _Optional[str] = ..., views: _Optional[_Iterable[_Union[_geometry_pb2.View, _Mapping]]] = ..., with_features: _Optional[bool] = ...) -> None: ...
+    def __init__(self, room: _Optional[str] = ..., room_revision: _Optional[int] = ..., adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ..., views: _Optional[_Iterable[_Union[_geometry_pb2.View, _Mapping]]] = ..., with_features: _Optional[bool] = ...) -> None: ...
 
 class EncodeResponse(_message.Message):
     __slots__ = ("adapter", "views")
@@ -163,7 +163,7 @@ class TrackRequest(_message.Message):
     def __init__(self, config: _Optional[_Union[TrackConfig, _Mapping]] = ..., frame: _Optional[_Union[TrackFrame, _Mapping]] = ..., set_initial_pose: _Optional[_Union[SetInitialPose, _Mapping]] = ..., reset: _Optional[_Union[Reset, _Mapping]] = ...) -> None: ...
 
 class TrackConfig(_message.Message):
-    __slots__ = ("room", "rooms", "room_revisions", "adapter", "adapter_revision", "initial_pose", "keyframes", "fusion", "frames", "back_pressure", "resume_token", "token_every", "base_from_camera", "camera", "gravity_in_map", "mapping_camera", "other_cameras", "inertial_sensor", "trust_odometry", "time_offset_ns")
+    __slots__ = ("room", "rooms", "room_revisions", "adapter", "adapter_revision", "initial_pose", "keyframes", "fusion", "frame_names", "back_pressure", "resume_token", "token_every", "base_from_camera", "camera", "gravity_in_map", "other_cameras", "inertial_sensor", "trust_odometry", "time_offset_ns")
     class RoomRevisionsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -179,14 +179,13 @@ class TrackConfig(_message.Message):
     INITIAL_POSE_FIELD_NUMBER: _ClassVar[int]
     KEYFRAMES_FIELD_NUMBER: _ClassVar[int]
     FUSION_FIELD_NUMBER: _ClassVar[int]
-    FRAMES_FIELD_NUMBER: _ClassVar[int]
+    FRAME_NAMES_FIELD_NUMBER: _ClassVar[int]
     BACK_PRESSURE_FIELD_NUMBER: _ClassVar[int]
     RESUME_TOKEN_FIELD_NUMBER: _ClassVar[int]
     TOKEN_EVERY_FIELD_NUMBER: _ClassVar[int]
     BASE_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
     CAMERA_FIELD_NUMBER: _ClassVar[int]
     GRAVITY_IN_MAP_FIELD_NUMBER: _ClassVar[int]
-    MAPPING_CAMERA_FIELD_NUMBER: _ClassVar[int]
     OTHER_CAMERAS_FIELD_NUMBER: _ClassVar[int]
     INERTIAL_SENSOR_FIELD_NUMBER: _ClassVar[int]
     TRUST_ODOMETRY_FIELD_NUMBER: _ClassVar[int]
@@ -199,39 +198,38 @@ class TrackConfig(_message.Message):
     initial_pose: InitialPose
     keyframes: KeyframePolicy
     fusion: Fusion
-    frames: FrameNames
+    frame_names: FrameNames
     back_pressure: BackPressure
     resume_token: bytes
     token_every: int
     base_from_camera: _geometry_pb2.Pose
-    camera: _geometry_pb2.CameraIntrinsics
+    camera: _geometry_pb2.ViewCamera
     gravity_in_map: _geometry_pb2.Vector3
-    mapping_camera: bool
     other_cameras: _containers.RepeatedCompositeFieldContainer[RigCamera]
     inertial_sensor: InertialSensor
     trust_odometry: bool
     time_offset_ns: int
-    def __init__(self, room: _Optional[str] = ..., rooms: _Optional[_Iterable[str]] = ..., room_revisions: _Optional[_Mapping[str, int]] = ..., adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ..., initial_pose: _Optional[_Union[InitialPose, _Mapping]] = ..., keyframes: _Optional[_Union[KeyframePolicy, _Mapping]] = ..., fusion: _Optional[_Union[Fusion, str]] = ..., frames: _Optional[_Union[FrameNames, _Mapping]] = ..., back_pressure: _Optional[_Union[BackPressure, str]] = ..., resume_token: _Optional[bytes] = ..., token_every: _Optional[int] = ..., base_from_camera: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., camera: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., gravity_in_map: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., mapping_camera: _Optional[bool] = ..., other_cameras: _Optional[_Iterable[_Union[RigCamera, _Mapping]]] = ..., inertial_sensor: _Optional[_Union[InertialSensor, _Mapping]] = ..., trust_odometry: _Optional[bool] = ..., time_offset_ns: _Optional[int] = ...) -> None: ...
+    def __init__(self, room: _Optional[str] = ..., rooms: _Optional[_Iterable[str]] = ..., room_revisions: _Optional[_Mapping[str, int]] = ..., adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ..., initial_pose: _Optional[_Union[InitialPose, _Mapping]] = ..., keyframes: _Optional[_Union[KeyframePolicy, _Mapping]] = ..., fusion: _Optional[_Union[Fusion, str]] = ..., frame_names: _Optional[_Union[FrameNames, _Mapping]] = ..., back_pressure: _Optional[_Union[BackPressure, str]] = ..., resume_token: _Optional[bytes] = ..., token_every: _Optional[int] = ..., base_from_camera: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., camera: _Optional[_Union[_geometry_pb2.ViewCamera, _Mapping]] = ..., gravity_in_map: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., other_cameras: _Optional[_Iterable[_Union[RigCamera, _Mapping]]] = ..., inertial_sensor: _Optional[_Union[InertialSensor, _Mapping]] = ..., trust_odometry: _Optional[bool] = ..., time_offset_ns: _Optional[int] = ...) -> None: ...
 
 class InertialSensor(_message.Message):
-    __slots__ = ("pose", "gyroscope_noise", "accelerometer_noise", "gyroscope_bias", "accelerometer_bias", "gyroscope_bias_walk", "accelerometer_bias_walk", "time_offset_ns")
+    __slots__ = ("pose", "gyroscope_noise", "accelerometer_noise", "gyroscope_bias_deviation", "accelerometer_bias_deviation", "gyroscope_bias_walk", "accelerometer_bias_walk", "time_offset_ns")
     POSE_FIELD_NUMBER: _ClassVar[int]
     GYROSCOPE_NOISE_FIELD_NUMBER: _ClassVar[int]
     ACCELEROMETER_NOISE_FIELD_NUMBER: _ClassVar[int]
-    GYROSCOPE_BIAS_FIELD_NUMBER: _ClassVar[int]
-    ACCELEROMETER_BIAS_FIELD_NUMBER: _ClassVar[int]
+    GYROSCOPE_BIAS_DEVIATION_FIELD_NUMBER: _ClassVar[int]
+    ACCELEROMETER_BIAS_DEVIATION_FIELD_NUMBER: _ClassVar[int]
     GYROSCOPE_BIAS_WALK_FIELD_NUMBER: _ClassVar[int]
     ACCELEROMETER_BIAS_WALK_FIELD_NUMBER: _ClassVar[int]
     TIME_OFFSET_NS_FIELD_NUMBER: _ClassVar[int]
     pose: _geometry_pb2.Pose
     gyroscope_noise: float
     accelerometer_noise: float
-    gyroscope_bias: float
-    accelerometer_bias: float
+    gyroscope_bias_deviation: float
+    accelerometer_bias_deviation: float
     gyroscope_bias_walk: float
     accelerometer_bias_walk: float
     time_offset_ns: int
-    def __init__(self, pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., gyroscope_noise: _Optional[float] = ..., accelerometer_noise: _Optional[float] = ..., gyroscope_bias: _Optional[float] = ..., accelerometer_bias: _Optional[float] = ..., gyroscope_bias_walk: _Optional[float] = ..., accelerometer_bias_walk: _Optional[float] = ..., time_offset_ns: _Optional[int] = ...) -> None: ...
+    def __init__(self, pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., gyroscope_noise: _Optional[float] = ..., accelerometer_noise: _Optional[float] = ..., gyroscope_bias_deviation: _Optional[float] = ..., accelerometer_bias_deviation: _Optional[float] = ..., gyroscope_bias_walk: _Optional[float] = ..., accelerometer_bias_walk: _Optional[float] = ..., time_offset_ns: _Optional[int] = ...) -> None: ...
 
 class InertialSample(_message.Message):
     __slots__ = ("timestamp_ns", "angular_velocity", "linear_acceleration")
@@ -244,16 +242,16 @@ class InertialSample(_message.Message):
     def __init__(self, timestamp_ns: _Optional[int] = ..., angular_velocity: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., linear_acceleration: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ...) -> None: ...
 
 class RigCamera(_message.Message):
-    __slots__ = ("name", "pose", "camera", "time_offset_ns")
+    __slots__ = ("name", "pose", "intrinsics", "time_offset_ns")
     NAME_FIELD_NUMBER: _ClassVar[int]
     POSE_FIELD_NUMBER: _ClassVar[int]
-    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    INTRINSICS_FIELD_NUMBER: _ClassVar[int]
     TIME_OFFSET_NS_FIELD_NUMBER: _ClassVar[int]
     name: str
     pose: _geometry_pb2.Pose
-    camera: _geometry_pb2.CameraIntrinsics
+    intrinsics: _geometry_pb2.CameraIntrinsics
     time_offset_ns: int
-    def __init__(self, name: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., camera: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., time_offset_ns: _Optional[int] = ...) -> None: ...
+    def __init__(self, name: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., time_offset_ns: _Optional[int] = ...) -> None: ...
 
 class DepthImage(_message.Message):
     __slots__ = ("png", "unit_m", "deviation_m")
@@ -266,22 +264,22 @@ class DepthImage(_message.Message):
     def __init__(self, png: _Optional[bytes] = ..., unit_m: _Optional[float] = ..., deviation_m: _Optional[float] = ...) -> None: ...
 
 class InitialPose(_message.Message):
-    __slots__ = ("pose", "translation_deviation_m", "rotation_deviation_rad")
+    __slots__ = ("pose", "position_deviation_m", "rotation_deviation_rad")
     POSE_FIELD_NUMBER: _ClassVar[int]
-    TRANSLATION_DEVIATION_M_FIELD_NUMBER: _ClassVar[int]
+    POSITION_DEVIATION_M_FIELD_NUMBER: _ClassVar[int]
     ROTATION_DEVIATION_RAD_FIELD_NUMBER: _ClassVar[int]
     pose: _geometry_pb2.Pose
-    translation_deviation_m: float
+    position_deviation_m: float
     rotation_deviation_rad: float
-    def __init__(self, pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., translation_deviation_m: _Optional[float] = ..., rotation_deviation_rad: _Optional[float] = ...) -> None: ...
+    def __init__(self, pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., position_deviation_m: _Optional[float] = ..., rotation_deviation_rad: _Optional[float] = ...) -> None: ...
 
 class KeyframePolicy(_message.Message):
-    __slots__ = ("displacement", "frames")
-    DISPLACEMENT_FIELD_NUMBER: _ClassVar[int]
-    FRAMES_FIELD_NUMBER: _ClassVar[int]
-    displacement: float
-    frames: int
-    def __init__(self, displacement: _Optional[float] = ..., frames: _Optional[int] = ...) -> None: ...
+    __slots__ = ("motion_norm", "sequence_interval")
+    MOTION_NORM_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_INTERVAL_FIELD_NUMBER: _ClassVar[int]
+    motion_norm: float
+    sequence_interval: int
+    def __init__(self, motion_norm: _Optional[float] = ..., sequence_interval: _Optional[int] = ...) -> None: ...
 
 class FrameNames(_message.Message):
     __slots__ = ("map", "odom", "camera", "base")
@@ -320,22 +318,22 @@ class TrackFrame(_message.Message):
     def __init__(self, timestamp_ns: _Optional[int] = ..., sequence_number: _Optional[int] = ..., view: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ..., with_token: _Optional[bool] = ..., odometry: _Optional[_Union[MeasuredOdometry, _Mapping]] = ..., gravity: _Optional[_Union[MeasuredGravity, _Mapping]] = ..., other_views: _Optional[_Iterable[_Union[OtherView, _Mapping]]] = ..., inertial_samples: _Optional[_Iterable[_Union[InertialSample, _Mapping]]] = ..., exposure_ns: _Optional[int] = ..., depth: _Optional[_Union[DepthImage, _Mapping]] = ...) -> None: ...
 
 class MeasuredGravity(_message.Message):
-    __slots__ = ("direction", "frame", "deviation_rad")
+    __slots__ = ("direction", "coordinate_frame", "deviation_rad")
     DIRECTION_FIELD_NUMBER: _ClassVar[int]
-    FRAME_FIELD_NUMBER: _ClassVar[int]
+    COORDINATE_FRAME_FIELD_NUMBER: _ClassVar[int]
     DEVIATION_RAD_FIELD_NUMBER: _ClassVar[int]
     direction: _geometry_pb2.Vector3
-    frame: str
+    coordinate_frame: str
     deviation_rad: float
-    def __init__(self, direction: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., frame: _Optional[str] = ..., deviation_rad: _Optional[float] = ...) -> None: ...
+    def __init__(self, direction: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., coordinate_frame: _Optional[str] = ..., deviation_rad: _Optional[float] = ...) -> None: ...
 
 class OtherView(_message.Message):
-    __slots__ = ("camera", "view")
-    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    __slots__ = ("camera_name", "view")
+    CAMERA_NAME_FIELD_NUMBER: _ClassVar[int]
     VIEW_FIELD_NUMBER: _ClassVar[int]
-    camera: str
+    camera_name: str
     view: _geometry_pb2.View
-    def __init__(self, camera: _Optional[str] = ..., view: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ...) -> None: ...
+    def __init__(self, camera_name: _Optional[str] = ..., view: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ...) -> None: ...
 
 class MeasuredOdometry(_message.Message):
     __slots__ = ("pose", "translation_share", "rotation_share", "velocity_covariance")
@@ -374,20 +372,20 @@ class TrackResponse(_message.Message):
     def __init__(self, started: _Optional[_Union[TrackStarted, _Mapping]] = ..., update: _Optional[_Union[TrackUpdate, _Mapping]] = ..., refusal: _Optional[_Union[TrackRefusal, _Mapping]] = ..., acknowledged: _Optional[_Union[TrackAcknowledged, _Mapping]] = ..., resume_token: _Optional[bytes] = ...) -> None: ...
 
 class TrackStarted(_message.Message):
-    __slots__ = ("adapter", "room", "frames", "keyframes", "calibration_rooms", "has_visual_odometry")
+    __slots__ = ("adapter", "room", "frame_names", "keyframes", "calibration_rooms", "has_visual_odometry")
     ADAPTER_FIELD_NUMBER: _ClassVar[int]
     ROOM_FIELD_NUMBER: _ClassVar[int]
-    FRAMES_FIELD_NUMBER: _ClassVar[int]
+    FRAME_NAMES_FIELD_NUMBER: _ClassVar[int]
     KEYFRAMES_FIELD_NUMBER: _ClassVar[int]
     CALIBRATION_ROOMS_FIELD_NUMBER: _ClassVar[int]
     HAS_VISUAL_ODOMETRY_FIELD_NUMBER: _ClassVar[int]
     adapter: _geometry_pb2.Revision
     room: _geometry_pb2.Revision
-    frames: FrameNames
+    frame_names: FrameNames
     keyframes: KeyframePolicy
     calibration_rooms: int
     has_visual_odometry: bool
-    def __init__(self, adapter: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., room: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., frames: _Optional[_Union[FrameNames, _Mapping]] = ..., keyframes: _Optional[_Union[KeyframePolicy, _Mapping]] = ..., calibration_rooms: _Optional[int] = ..., has_visual_odometry: _Optional[bool] = ...) -> None: ...
+    def __init__(self, adapter: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., room: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., frame_names: _Optional[_Union[FrameNames, _Mapping]] = ..., keyframes: _Optional[_Union[KeyframePolicy, _Mapping]] = ..., calibration_rooms: _Optional[int] = ..., has_visual_odometry: _Optional[bool] = ...) -> None: ...
 
 class TrackUpdate(_message.Message):
     __slots__ = ("timestamp_ns", "sequence_number", "status", "reason", "contradicted", "room", "camera", "base", "map_from_odom", "keyframe", "match", "hypothesis", "timing")
@@ -440,18 +438,18 @@ class KeyframeMotion(_message.Message):
     def __init__(self, motion: _Optional[_Union[_geometry_pb2.TwistWithCovariance, _Mapping]] = ..., sequence_number: _Optional[int] = ..., is_new: _Optional[bool] = ...) -> None: ...
 
 class TrackMatch(_message.Message):
-    __slots__ = ("novelty", "frame", "used", "mahalanobis_squared", "camera")
+    __slots__ = ("novelty", "frame", "used", "mahalanobis_squared", "camera_name")
     NOVELTY_FIELD_NUMBER: _ClassVar[int]
     FRAME_FIELD_NUMBER: _ClassVar[int]
     USED_FIELD_NUMBER: _ClassVar[int]
     MAHALANOBIS_SQUARED_FIELD_NUMBER: _ClassVar[int]
-    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_NAME_FIELD_NUMBER: _ClassVar[int]
     novelty: float
     frame: _geometry_pb2.RetrievedFrame
     used: bool
     mahalanobis_squared: float
-    camera: str
-    def __init__(self, novelty: _Optional[float] = ..., frame: _Optional[_Union[_geometry_pb2.RetrievedFrame, _Mapping]] = ..., used: _Optional[bool] = ..., mahalanobis_squared: _Optional[float] = ..., camera: _Optional[str] = ...) -> None: ...
+    camera_name: str
+    def __init__(self, novelty: _Optional[float] = ..., frame: _Optional[_Union[_geometry_pb2.RetrievedFrame, _Mapping]] = ..., used: _Optional[bool] = ..., mahalanobis_squared: _Optional[float] = ..., camera_name: _Optional[str] = ...) -> None: ...
 
 class PoseHypothesis(_message.Message):
     __slots__ = ("room", "map_from_camera", "sequence_number", "agreed", "needed")
@@ -474,18 +472,18 @@ class TrackTiming(_message.Message):
     def __init__(self, elapsed_ns: _Optional[int] = ...) -> None: ...
 
 class TrackRefusal(_message.Message):
-    __slots__ = ("timestamp_ns", "sequence_number", "reason", "message", "frames")
+    __slots__ = ("timestamp_ns", "sequence_number", "reason", "message", "frame_count")
     TIMESTAMP_NS_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_NUMBER_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
     MESSAGE_FIELD_NUMBER: _ClassVar[int]
-    FRAMES_FIELD_NUMBER: _ClassVar[int]
+    FRAME_COUNT_FIELD_NUMBER: _ClassVar[int]
     timestamp_ns: int
     sequence_number: int
     reason: TrackRefusalReason
     message: str
-    frames: int
-    def __init__(self, timestamp_ns: _Optional[int] = ..., sequence_number: _Optional[int] = ..., reason: _Optional[_Union[TrackRefusalReason, str]] = ..., message: _Optional[str] = ..., frames: _Optional[int] = ...) -> None: ...
+    frame_count: int
+    def __init__(self, timestamp_ns: _Optional[int] = ..., sequence_number: _Optional[int] = ..., reason: _Optional[_Union[TrackRefusalReason, str]] = ..., message: _Optional[str] = ..., frame_count: _Optional[int] = ...) -> None: ...
 
 class TrackAcknowledged(_message.Message):
     __slots__ = ()

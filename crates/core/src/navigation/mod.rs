@@ -22,7 +22,7 @@ pub use kind::NavigatorKind;
 pub use multi_step::{Leg, Mode, Plan, Space, Start, Step, walk};
 pub use navigator::{Answer, AnswerStep, Navigator, RetrievedFrame, StepError};
 pub use pursuit::{Feedback, Outcome, Pursuit, pursue};
-pub use query::{Displacement, FitOn, Limits, Query, Source, SourceAt};
+pub use query::{FitOn, Limits, Query, RequestedMotion, Source, SourceAt};
 pub use search::{IndexKind, RetrievalMetric, Search};
 pub use stepper::{Refit, RefitData, StepKind, Stepper};
 
@@ -67,14 +67,14 @@ pub enum Error {
     TopK { actual: u32, most: u32 },
     #[error("steps times top_k is {actual}, over the limit of {most} frames in one answer")]
     FramesInAnswer { actual: u64, most: u64 },
-    #[error("displacement has no twist; give at least one")]
+    #[error("motion has no twist; give at least one")]
     NoTwist,
     #[error(
-        "displacement {position} has a number that is not finite or a translation over {MAX_TRANSLATION_M:e} m"
+        "motion {position} has a number that is not finite or a translation over {MAX_TRANSLATION_M:e} m"
     )]
     TwistNotFinite { position: usize },
     #[error(
-        "displacement {position} turns by {angle_rad:.6} rad; a motion must turn by less than π ({:.6}), \
+        "motion {position} turns by {angle_rad:.6} rad; it must turn by less than π ({:.6}), \
          or its logarithm is not unique: divide it into parts",
         std::f64::consts::PI
     )]

@@ -6,7 +6,7 @@ use ndarray::{Array1, Array2, ArrayView1, ArrayView2};
 use strum::VariantArray;
 
 use super::{
-    Displacement, Error, FitOn, IndexKind, Leg, Limits, Plan, Query, Refit, RefitData,
+    Error, FitOn, IndexKind, Leg, Limits, Plan, Query, Refit, RefitData, RequestedMotion,
     RetrievalMetric, Search, Source, Space, Start, StepKind, Stepper, check_twist, walk,
 };
 use crate::adapter::Adapter;
@@ -71,7 +71,7 @@ pub struct Answer {
     pub steps: Vec<AnswerStep>,
     /// The whole requested motion in the source's body frame, if the source's pose is known and the
     /// logarithm is unique.
-    pub displacement: Option<Twist>,
+    pub motion: Option<Twist>,
 }
 
 /// One room under one adapter: the latents of all frames and an index over them. Immutable, except
@@ -277,7 +277,7 @@ impl Navigator {
     ) -> Result<Answer, Error> {
         query.check(limits)?;
         let start = self.start(&query.source.source, query.source.pose)?;
-        let twists = self.twists(&query.displacement, &start)?;
+        let twists = self.twists(&query.motion, &start)?;
         let stepper = self.stepper(query.step, query.fit_on)?;
         let space = Space {
             stepper: &stepper,
@@ -320,14 +320,14 @@ impl Navigator {
         }
 
         // All motions as one twist, from the source to the last requested pose.
-        let displacement = start
+        let motion = start
             .pose
             .zip(wanted)
             .map(|(from, to)| body_twist(&from, &to));
 
         Ok(Answer {
             steps,
-            displacement: displacement.filter(|twist| twist.is_unique_logarithm()),
+            motion: motion.filter(|twist| twist.is_unique_logarithm()),
         })
     }
 
@@ -342,13 +342,13 @@ impl Navigator {
         }
     }
 
-    fn twists(&self, displacement: &Displacement, start: &Start) -> Result<Vec<Twist>, Error> {
-        let target = match displacement {
-            Displacement::Twists(twists) => return Ok(twists.clone()),
-            Displacement::TargetFrame(frame) => {
+    fn twists(&self, motion: &RequestedMotion, start: &Start) -> Result<Vec<Twist>, Error> {
+        let target = match motion {
+            RequestedMotion::Twists(twists) => return Ok(twists.clone()),
+            RequestedMotion::TargetFrame(frame) => {
                 *self.room.pose(*frame).map_err(Error::TargetFrame)?
             }
-            Displacement::TargetPose(pose) => *pose,
+            RequestedMotion::TargetPose(pose) => *pose,
         };
 
         let source = start.pose.ok_or(Error::PoseNeeded { what: "a target" })?;

@@ -27,7 +27,7 @@ pub struct SourceAt {
 
 /// The requested motion.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Displacement {
+pub enum RequestedMotion {
     /// Consecutive motions, each in the body frame at its start; usually one.
     Twists(Vec<Twist>),
     /// The motion to a frame of the room.
@@ -52,7 +52,7 @@ pub struct Query {
     /// The source.
     pub source: SourceAt,
     /// The requested motion.
-    pub displacement: Displacement,
+    pub motion: RequestedMotion,
     /// Number of equal steps per motion.
     pub steps: u32,
     /// How the steps are chained.
@@ -100,8 +100,8 @@ impl Query {
     /// [`Error::TwistBeyondPi`] for an invalid motion; [`Error::Steps`], [`Error::TopK`] or
     /// [`Error::FramesInAnswer`] for a count that is zero or over its limit.
     pub fn check(&self, limits: Limits) -> Result<(), Error> {
-        let motions = match &self.displacement {
-            Displacement::Twists(twists) => {
+        let motions = match &self.motion {
+            RequestedMotion::Twists(twists) => {
                 if twists.is_empty() {
                     return Err(Error::NoTwist);
                 }
@@ -113,7 +113,7 @@ impl Query {
 
                 twists.len() as u64
             }
-            Displacement::TargetFrame(_) | Displacement::TargetPose(_) => 1,
+            RequestedMotion::TargetFrame(_) | RequestedMotion::TargetPose(_) => 1,
         };
 
         // The limits apply to the sum over all motions.

@@ -32,25 +32,35 @@ use seese3_core::room::Room;
 const FORMAT: &str = "seese3 bundle 1";
 const SAYS: &str = "bundle.json";
 
-/// The content of `bundle.json`.
+/// The content of `bundle.json`. Programs that write one may leave out what has a default.
 #[derive(Debug, Serialize, Deserialize)]
 struct Bundle {
     /// Always [`FORMAT`].
     format: String,
+    #[serde(default)]
     name: String,
     /// The format that the room was first read from.
+    #[serde(default)]
     recorded_as: String,
+    #[serde(default)]
     licence: String,
     /// The folder that the image paths are relative to. If it is relative itself, it starts from
     /// the bundle's folder.
+    #[serde(default)]
     images_root: String,
     /// Whether `frame_ids.npy` holds the recording's own frame numbers; if not, it holds row
     /// numbers.
+    #[serde(default)]
     numbered: bool,
+    #[serde(default)]
     names: Vec<String>,
+    #[serde(default)]
     images: Vec<String>,
+    #[serde(default)]
     sequences: Vec<u32>,
+    #[serde(default)]
     held_out: Vec<bool>,
+    #[serde(default)]
     worst_rotation_deviation: f64,
     /// The camera, in image widths, if known.
     #[serde(default)]

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use half::f16;
 use nalgebra::Matrix4;
 use ndarray::{Array2, ArrayD, ArrayViewD, Ix2};
 use ndarray_npy::{ViewElement, ViewNpyError, ViewNpyExt};
@@ -14,6 +15,8 @@ use seese3_core::room::Frames;
 /// The alignment of the numbers in memory, bytes. It is enough for every type read here; in a file,
 /// NumPy aligns them to 64 bytes.
 const ALIGNMENT: usize = 16;
+/// The beginning of a file that has the type of the numbers, bytes.
+const HEADER: usize = 256;
 
 /// A `.npy` file in memory, placed so that its numbers are aligned. The array is viewed in place,
 /// so a size in the header that exceeds the file is an error, not an allocation.
@@ -24,8 +27,10 @@ struct NpyFile {
 
 impl NpyFile {
     fn read(file: &Path) -> Result<Self, Error> {
-        let content = read_bytes(file)?;
+        Ok(Self::aligned(&read_bytes(file)?))
+    }
 
+    fn aligned(content: &[u8]) -> Self {
         // The length of the header is in bytes 8 and 9 in version 1 of the format, and in bytes 8
         // to 11 from version 2 on.
         let header = match content.get(6..12) {
@@ -41,27 +46,51 @@ impl NpyFile {
         let mut bytes = vec![0; content.len() + ALIGNMENT];
         let start =
             (ALIGNMENT - (bytes.as_ptr() as usize).wrapping_add(header) % ALIGNMENT) % ALIGNMENT;
-        bytes[start..start + content.len()].copy_from_slice(&content);
+        bytes[start..start + content.len()].copy_from_slice(content);
 
         // Truncating does not reallocate, so the alignment is kept.
         bytes.truncate(start + content.len());
-        Ok(Self { bytes, start })
+        Self { bytes, start }
     }
 
     fn view<T: ViewElement>(&self) -> Result<ArrayViewD<'_, T>, ViewNpyError> {
         ArrayViewD::view_npy(&self.bytes[self.start..])
     }
 
-    /// The numbers as f64, whether stored as f64 or f32.
+    /// The numbers as f64, whether stored as f64, f32 or f16.
     fn floats(&self, file: &Path) -> Result<ArrayD<f64>, Error> {
+        let expected = |error: ViewNpyError| {
+            malformed(
+                file,
+                &format!("{error}; expected float64, float32 or float16"),
+            )
+        };
         match self.view::<f64>() {
             Ok(view) => Ok(view.to_owned()),
-            Err(ViewNpyError::WrongDescriptor(_)) => self
-                .view::<f32>()
-                .map(|view| view.mapv(f64::from))
-                .map_err(|error| malformed(file, &format!("{error}; expected float32 or float64"))),
+            Err(ViewNpyError::WrongDescriptor(_)) => match self.view::<f32>() {
+                Ok(view) => Ok(view.mapv(f64::from)),
+                Err(ViewNpyError::WrongDescriptor(error)) => {
+                    let halves = self.halves();
+                    halves
+                        .unwrap_or_else(|| Err(ViewNpyError::WrongDescriptor(error)))
+                        .map_err(expected)
+                }
+                Err(error) => Err(malformed(file, &error.to_string())),
+            },
             Err(error) => Err(malformed(file, &error.to_string())),
         }
+    }
+
+    /// The numbers of an array of f16; `None` if the file has another type. ndarray-npy does not
+    /// read f16, so its bits are read as integers.
+    fn halves(&self) -> Option<Result<ArrayD<f64>, ViewNpyError>> {
+        let header = &self.bytes[self.start..(self.start + HEADER).min(self.bytes.len())];
+        let at = header.windows(5).position(|text| text == b"'<f2'")?;
+        let mut integers = self.bytes[self.start..].to_vec();
+        integers[at..][..5].copy_from_slice(b"'<u2'");
+        let integers = Self::aligned(&integers);
+        let read = integers.view::<u16>();
+        Some(read.map(|view| view.mapv(|bits| f16::from_bits(bits).to_f64())))
     }
 }
 
@@ -72,17 +101,21 @@ fn malformed(file: &Path, problem: &str) -> Error {
     }
 }
 
-/// Reads poses, `world_from_camera`, metres, from an array (n, 4, 4) of f64 or f32.
+/// Reads poses, `world_from_camera`, meters, from an array (n, 4, 4) or (n, 3, 4) of f64, f32 or
+/// f16.
 ///
 /// # Errors
 /// [`Error::Io`] if the file cannot be read, [`Error::Malformed`] for another shape or type,
 /// [`Error::Frame`] for a matrix that is not a pose.
 pub fn read_poses(file: &Path) -> Result<Recording, Error> {
     let matrices = NpyFile::read(file)?.floats(file)?;
-    let &[count, 4, 4] = matrices.shape() else {
+    let &[count, 3 | 4, 4] = matrices.shape() else {
         return Err(malformed(
             file,
-            &format!("has shape {:?}, poses are (n, 4, 4)", matrices.shape()),
+            &format!(
+                "has shape {:?}, poses are (n, 4, 4) or (n, 3, 4)",
+                matrices.shape()
+            ),
         ));
     };
 
@@ -101,7 +134,10 @@ pub fn read_poses(file: &Path) -> Result<Recording, Error> {
 
         // Unlike in the other formats, a frame is never dropped here: timestamps and features
         // belong to the poses by row.
-        let matrix = Matrix4::from_row_iterator(matrix.iter().copied());
+        // Matrices (3, 4) lack the last row, which is the same for all poses.
+        let last_row = [0.0, 0.0, 0.0, 1.0];
+        let numbers = matrix.iter().copied().chain(last_row).take(16);
+        let matrix = Matrix4::from_row_iterator(numbers);
         let (pose, deviation) = pose_from_matrix(&matrix).map_err(|error| match error {
             GivenPoseError::NotFinite => wrong("the pose has a number that is not finite".into()),
             GivenPoseError::Singular => {
@@ -120,7 +156,7 @@ pub fn read_poses(file: &Path) -> Result<Recording, Error> {
     })
 }
 
-/// Reads features from an array (n, d) of f32 or f64.
+/// Reads features from an array (n, d) of f32, f64 or f16.
 ///
 /// # Errors
 /// [`Error::Io`] if the file cannot be read, [`Error::Malformed`] for another shape or type.
@@ -231,6 +267,46 @@ mod tests {
                 ndarray::array![[1.5, -2.0]]
             );
         }
+    }
+
+    /// Oracle: IEEE 754: a half has 5 bits of exponent with the bias 15, and 10 of mantissa. 1.5 is
+    /// 0x3E00, −2 is 0xC000, and the smallest number above 0 is 2⁻²⁴.
+    #[test]
+    fn halves_are_read() {
+        let data: Vec<u8> = [0x3E00u16, 0xC000, 0x0001, 0x7BFF]
+            .iter()
+            .flat_map(|bits| bits.to_le_bytes())
+            .collect();
+        let file = written(&npy("<f2", "(2, 2)", &data));
+        assert_eq!(
+            read_features(file.path()).unwrap(),
+            ndarray::array![[1.5, -2.0], [2.0f32.powi(-24), 65504.0]]
+        );
+        let file = written(&npy("<f2", "(3, 2)", &data));
+        assert!(read_features(file.path()).is_err());
+    }
+
+    /// Oracle: the same poses with their last row.
+    #[test]
+    fn poses_may_lack_their_last_row() {
+        let three: Vec<u8> = (0..2)
+            .flat_map(|k| {
+                let k = f64::from(k);
+                [1.0, 0.0, 0.0, k, 0.0, 1.0, 0.0, 2.0, 0.0, 0.0, 1.0, 3.0]
+            })
+            .flat_map(f64::to_le_bytes)
+            .collect();
+        let read = |shape: &str| {
+            let file = written(&npy("<f8", shape, &three));
+            read_poses(file.path()).map(|read| read.frames.poses)
+        };
+        let poses = read("(2, 3, 4)").unwrap();
+        assert_eq!(
+            poses[1].translation,
+            nalgebra::Translation3::new(1.0, 2.0, 3.0)
+        );
+        assert_eq!(poses[1].rotation.angle(), 0.0);
+        assert!(read("(2, 4, 3)").is_err());
     }
 
     /// Oracle: the NumPy format. Cases: a size larger than any file, a truncated file, a wrong

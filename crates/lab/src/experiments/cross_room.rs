@@ -152,24 +152,60 @@ pub fn train_and_test(
     plan: &CrossRoomPlan<'_>,
     progress: &CrossRoomProgress<'_>,
 ) -> Result<CrossRoomResult, Error> {
-    let Some(training_rooms) = rooms.len().checked_sub(plan.calibration_rooms) else {
-        return Err(Error::Input(format!(
+    let trained = train_and_calibrate(rooms, plan, progress)?;
+    test_trained(trained, rooms, held_out, plan, progress)
+}
+
+/// The training rooms and the calibration rooms of a plan.
+fn parted<'a, 'b>(
+    rooms: &'a [RoomData<'b>],
+    plan: &CrossRoomPlan<'_>,
+) -> Result<(&'a [RoomData<'b>], &'a [RoomData<'b>]), Error> {
+    let training_rooms = rooms.len().checked_sub(plan.calibration_rooms);
+    let training_rooms = training_rooms.ok_or_else(|| {
+        Error::Input(format!(
             "cannot use {} of {} rooms for calibration",
             plan.calibration_rooms,
             rooms.len()
-        )));
-    };
-    let (training, calibration) = rooms.split_at(training_rooms);
-    let (mut adapter, mut record) =
-        train_adapter(training, plan.training, &mut |_| (progress.epoch)())?;
+        ))
+    })?;
+    Ok(rooms.split_at(training_rooms))
+}
 
-    if !calibration.is_empty() {
-        Calibrated {
-            adapter,
-            record,
-            ..
-        } = calibrate_retrieval(adapter, record, calibration)?;
+/// Trains an adapter on `rooms`, of which the last ones calibrate it.
+///
+/// # Errors
+/// [`Error`] when the training or the calibration fails.
+pub fn train_and_calibrate(
+    rooms: &[RoomData<'_>],
+    plan: &CrossRoomPlan<'_>,
+    progress: &CrossRoomProgress<'_>,
+) -> Result<(Adapter, TrainingRecord), Error> {
+    let (training, calibration) = parted(rooms, plan)?;
+    let (adapter, record) = train_adapter(training, plan.training, &mut |_| (progress.epoch)())?;
+    if calibration.is_empty() {
+        return Ok((adapter, record));
     }
+
+    let Calibrated {
+        adapter, record, ..
+    } = calibrate_retrieval(adapter, record, calibration)?;
+    Ok((adapter, record))
+}
+
+/// Evaluates an adapter of [`train_and_calibrate`] in the rooms `held_out`.
+///
+/// # Errors
+/// [`Error::Input`] if there are more calibration rooms than rooms. A held-out room that cannot be
+/// evaluated is skipped; the run records the reason.
+pub fn test_trained(
+    (adapter, record): (Adapter, TrainingRecord),
+    rooms: &[RoomData<'_>],
+    held_out: &[RoomData<'_>],
+    plan: &CrossRoomPlan<'_>,
+    progress: &CrossRoomProgress<'_>,
+) -> Result<CrossRoomResult, Error> {
+    let (training, calibration) = parted(rooms, plan)?;
 
     let mut run = CrossRoomRun {
         training_rooms: names(training),

@@ -104,6 +104,9 @@ pub enum Error {
     /// A result could not be rendered.
     #[error("a result cannot be rendered")]
     Rendering(#[source] Box<dyn std::error::Error + Send + Sync>),
+    /// What an interrupted run has left cannot be read or written.
+    #[error("{0}")]
+    Journal(String),
     /// A seed does not fit in 32 bits, the seed size of PyTorch.
     #[error("--seed plus --seeds must be at most 2³²")]
     Seed,

@@ -3,6 +3,7 @@
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
+use serde::{Deserialize, Serialize};
 
 use super::table::{Table, escaped};
 
@@ -16,7 +17,7 @@ pub struct Document {
 }
 
 /// A part with a heading.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct Section {
     /// Its heading.
     pub title: String,
@@ -25,7 +26,7 @@ pub struct Section {
 }
 
 /// A piece of a section.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub enum Block {
     /// A paragraph, plain text.
     Text(String),
@@ -36,14 +37,31 @@ pub enum Block {
 }
 
 /// A picture.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Picture {
     /// Its file name, which ends with `.svg` or `.png`.
     pub name: String,
     /// The bytes of the SVG or PNG file.
+    #[serde(with = "base64_bytes")]
     pub bytes: Vec<u8>,
     /// The caption, which is also the alternative text.
     pub caption: String,
+}
+
+/// Bytes as text in JSON.
+mod base64_bytes {
+    use base64::Engine;
+    use base64::engine::general_purpose::STANDARD;
+    use serde::{Deserialize, Deserializer, Serializer};
+
+    pub fn serialize<S: Serializer>(bytes: &[u8], to: S) -> Result<S::Ok, S::Error> {
+        to.serialize_str(&STANDARD.encode(bytes))
+    }
+
+    pub fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<u8>, D::Error> {
+        let text = String::deserialize(from)?;
+        STANDARD.decode(text).map_err(serde::de::Error::custom)
+    }
 }
 
 impl Section {

@@ -15,6 +15,18 @@ use seese3_core::statistics::Rate;
 /// Two tables with one line per navigator. The first has latent scores and Hit@ε with 95 %
 /// intervals; the second has median pose errors and joint recalls.
 pub fn evaluation_table(report: &Report) -> String {
+    let [scores, poses] = evaluation_tables(report);
+    format!("{scores}\n\n{poses}")
+}
+
+/// The tables of an evaluation as Markdown.
+pub fn evaluation_markdown(report: &Report) -> String {
+    let tables = evaluation_tables(report);
+    tables.map(|table| table.markdown()).join("\n")
+}
+
+/// The table of scores of navigators, and that of the errors of retrieved poses.
+fn evaluation_tables(report: &Report) -> [Table; 2] {
     let thresholds = report.protocol.thresholds.iter();
     let hits: String = thresholds
         .map(|epsilon| format!(" | Hit@{epsilon} [95 %]"))
@@ -58,7 +70,7 @@ pub fn evaluation_table(report: &Report) -> String {
         poses.row(row.label(), medians.into_iter().chain(recalls));
     }
 
-    format!("{scores}\n\n{poses}")
+    [scores, poses]
 }
 
 fn interval(rate: &Rate) -> String {

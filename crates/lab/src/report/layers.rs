@@ -2,54 +2,112 @@
 
 use super::table::{Table, fixed, grouped};
 use crate::experiments::layers::LayerScores;
-use seese3_core::statistics::mean;
+use seese3_core::statistics::{deviation, mean};
+
+/// What a column of the table shows of a layer, and whether more of it is better.
+#[derive(Clone, Copy)]
+struct Metric {
+    value: fn(&LayerScores) -> f64,
+    /// The larger, the better.
+    merit: fn(f64) -> f64,
+    /// The score of the simplest answer, which the best layer has to exceed; if there is one.
+    baseline: Option<fn(&LayerScores) -> f64>,
+    /// The deviation over seeds, if the metric depends on them.
+    deviation: Option<fn(&LayerScores) -> f64>,
+}
+
+/// SE(3) has six dimensions: features that encode only the camera pose have an intrinsic dimension
+/// near six. Larger and smaller values are both worse.
+const METRICS: [Metric; 5] = [
+    Metric {
+        value: |score| score.m1.value,
+        merit: |value| value,
+        baseline: None,
+        deviation: None,
+    },
+    Metric {
+        value: |score| score.m2.twonn,
+        merit: |value| -(value - 6.0).abs(),
+        baseline: None,
+        deviation: None,
+    },
+    Metric {
+        value: |score| score.m2.mle,
+        merit: |value| -(value - 6.0).abs(),
+        baseline: None,
+        deviation: None,
+    },
+    Metric {
+        value: |score| score.m3.r2,
+        merit: |value| value,
+        baseline: Some(|score| score.constant_r2),
+        deviation: None,
+    },
+    Metric {
+        value: |score| score.m4.r2,
+        merit: |value| value,
+        baseline: Some(|score| score.constant_r2),
+        deviation: Some(|score| score.m4.deviation),
+    },
+];
+
+impl Metric {
+    /// Whether a layer is the best of `layers`: it exceeds the simplest answer, and every other
+    /// layer by more than the deviations of the difference over rooms and over seeds.
+    fn is_best(&self, layer: &[&LayerScores], layers: &[Vec<&LayerScores>]) -> bool {
+        let merit = |layer: &[&LayerScores]| (self.merit)(over(layer, self.value));
+        let exceeds_baseline = self
+            .baseline
+            .is_none_or(|baseline| over(layer, self.value) > over(layer, baseline));
+
+        let mut others = layers
+            .iter()
+            .filter(|other| other[0].features != layer[0].features);
+        exceeds_baseline
+            && others.all(|other| merit(layer) - merit(other) > self.uncertainty(layer, other))
+    }
+
+    /// The larger of the deviation over rooms of the difference of two layers, and their deviations
+    /// over seeds; 0 if there is only one room and seeds do not matter.
+    fn uncertainty(&self, layer: &[&LayerScores], other: &[&LayerScores]) -> f64 {
+        let merit = |score: &LayerScores| (self.merit)((self.value)(score));
+        let differences: Vec<f64> = layer
+            .iter()
+            .filter_map(|score| {
+                let same_room = other.iter().find(|other| other.room == score.room)?;
+                Some(merit(score) - merit(same_room))
+            })
+            .collect();
+
+        let seeds = self.deviation.into_iter();
+        let seeds = seeds.flat_map(|of| [over(layer, of), over(other, of)]);
+        let known = seeds.chain([deviation(&differences)]);
+        known.filter(|value| value.is_finite()).fold(0.0, f64::max)
+    }
+}
 
 /// One line per layer with means over rooms. A star marks the best layer of each metric; for the
-/// intrinsic dimension that is the layer nearest to 6. The last column is the R² of the constant
-/// baseline, which always predicts the mean training motion.
+/// intrinsic dimension that is the layer nearest to 6. There is none if another layer is within the
+/// deviation, or if the best R² is below that of the constant baseline, which always predicts the
+/// mean training motion and is in the last column.
 pub fn layers_table(scores: &[LayerScores]) -> Table {
     let layers = grouped(scores, |score| &score.features);
 
-    // SE(3) has six dimensions: features that encode only the camera pose have an intrinsic
-    // dimension near six. Larger and smaller values are both worse.
-    type Score = fn(&LayerScores) -> f64;
-    type Merit = fn(f64) -> f64;
-    let highest: Merit = |value| value;
-    let near_six: Merit = |value| -(value - 6.0).abs();
-
-    let metrics: [(Score, Merit); 5] = [
-        (|score| score.m1.value, highest),
-        (|score| score.m2.twonn, near_six),
-        (|score| score.m2.mle, near_six),
-        (|score| score.m3.r2, highest),
-        (|score| score.m4.r2, highest),
-    ];
-    let best = metrics.map(|(of, merit)| {
-        let merits = layers.iter().map(|layer| merit(over(layer, of)));
-        merits.fold(f64::NEG_INFINITY, f64::max)
-    });
-
     let mut table = Table::new("features | columns | M1 | TwoNN | MLE | M3 R² | M4 R² | constant");
     for layer in &layers {
-        let star = |place: usize| {
-            let (of, merit) = metrics[place];
-            if merit(over(layer, of)) >= best[place] {
-                "*"
-            } else {
-                " "
-            }
+        let star = |metric: &Metric| match metric.is_best(layer, &layers) {
+            true => "*",
+            false => " ",
         };
 
         let mut cells = vec![layer[0].dim.to_string()];
-        cells.extend(
-            (0..4).map(|place| format!("{:.3}{}", over(layer, metrics[place].0), star(place))),
-        );
-
-        // The deviation over seeds stands between the mean of M4 and its star.
-        let m4 = over(layer, |score| score.m4.r2);
-        let deviation = over(layer, |score| score.m4.deviation);
-        let spread = deviation.is_finite().then(|| format!(" ± {deviation:.3}"));
-        cells.push(format!("{m4:.3}{}{}", spread.unwrap_or_default(), star(4)));
+        for metric in &METRICS {
+            let value = over(layer, metric.value);
+            let spread = metric.deviation.map(|of| over(layer, of));
+            let spread = spread.filter(|spread| spread.is_finite());
+            let spread = spread.map_or_else(String::new, |spread| format!(" ± {spread:.3}"));
+            cells.push(format!("{value:.3}{spread}{}", star(metric)));
+        }
         cells.push(format!("{:.3}", over(layer, |score| score.constant_r2)));
 
         table.row(&layer[0].features, cells);
@@ -96,14 +154,11 @@ mod tests {
     use super::*;
     use crate::experiments::layers::{AdapterScores, LayerDimension, MutualKnnShare, RidgeScore};
 
-    /// Oracle: by hand. Means over two rooms. The best dimension is the nearest to 6, not the
-    /// highest.
-    #[test]
-    fn the_best_of_each_metric_has_a_star() {
-        let score = |features: &str, value: f64, dimension: f64, r2: f64| LayerScores {
+    fn score(features: &str, room: &str, value: f64, dimension: f64, r2: f64) -> LayerScores {
+        LayerScores {
             features: features.to_owned(),
             encoder: "e".to_owned(),
-            room: "r".to_owned(),
+            room: room.to_owned(),
             dim: 4,
             m1: MutualKnnShare { value },
             m2: LayerDimension {
@@ -120,30 +175,61 @@ mod tests {
                 runs: vec![r2],
             },
             constant_r2: -3.0,
-        };
+        }
+    }
 
-        let scores = [
-            score("a", 0.2, 5.5, -1.0),
-            score("a", 0.4, 5.5, 0.0),
-            score("b", 0.5, 9.0, -2.0),
-        ];
-        let table = layers_table(&scores).to_string();
-        let lines: Vec<&str> = table.lines().collect();
+    fn lines(scores: &[LayerScores]) -> Vec<String> {
+        let table = layers_table(scores).to_string();
+        table.lines().skip(1).map(str::to_owned).collect()
+    }
 
-        assert_eq!(lines.len(), 3);
+    /// Oracle: by hand. Means over two rooms. The best dimension is the nearest to 6, not the
+    /// highest. In M1, b is better by 0.2 and 0.2 in the two rooms, a deviation of 0.
+    #[test]
+    fn the_best_of_each_metric_has_a_star() {
+        let lines = lines(&[
+            score("a", "r", 0.2, 5.5, -1.0),
+            score("a", "s", 0.4, 5.5, 0.0),
+            score("b", "r", 0.4, 9.0, -2.5),
+            score("b", "s", 0.6, 9.0, -1.5),
+        ]);
+        assert_eq!(lines.len(), 2);
+        for cell in ["0.300 ", "5.500*", "-0.500*", "-0.500 ± 0.100*"] {
+            assert!(lines[0].contains(cell), "{cell}: {lines:?}");
+        }
+        for cell in ["0.500*", "9.000 "] {
+            assert!(lines[1].contains(cell), "{cell}: {lines:?}");
+        }
+    }
 
+    /// Oracle: by hand. In M1, b is better by 0.3 and worse by 0.1: 0.1 ± 0.28 over rooms. In M4, a
+    /// is better by 0.05, with 0.1 over seeds.
+    #[test]
+    fn a_difference_within_the_deviation_has_no_star() {
+        let lines = lines(&[
+            score("a", "r", 0.2, 6.0, -1.0),
+            score("a", "s", 0.4, 6.0, -1.0),
+            score("b", "r", 0.5, 6.0, -1.05),
+            score("b", "s", 0.3, 6.0, -1.05),
+        ]);
         assert!(
-            lines[1].contains("0.300 ")
-                && lines[1].contains("5.500*")
-                && lines[1].contains("-0.500*"),
-            "{table}"
+            lines[0].contains("0.300 ") && lines[1].contains("0.400 "),
+            "{lines:?}"
         );
+        assert!(lines[0].contains("-1.000 ± 0.100 "), "{lines:?}");
+        // The ridge probe has no seeds, and is better in both rooms by the same.
+        assert!(lines[0].contains("-1.000*"), "{lines:?}");
+    }
 
-        assert!(lines[1].contains("-0.500 ± 0.100*"), "{table}");
-
-        assert!(
-            lines[2].contains("0.500*") && lines[2].contains("9.000 "),
-            "{table}"
-        );
+    /// Oracle: by hand: −4 is below the −3 of the constant answer.
+    #[test]
+    fn what_is_worse_than_a_constant_has_no_star() {
+        let lines = lines(&[
+            score("a", "r", 0.2, 6.0, -4.0),
+            score("b", "r", 0.3, 7.0, -5.0),
+        ]);
+        assert!(lines[1].contains("0.300*"), "{lines:?}");
+        assert!(!lines[0].contains("-4.000*"), "{lines:?}");
+        assert!(!lines[0].contains("0.100*"), "{lines:?}");
     }
 }

@@ -31,7 +31,7 @@ pub fn localization_table(found: &Localization) -> Table {
 
 /// One line per method and part of the views: share answered, medians with intervals, 90 %
 /// quantiles, wrong answers and coverage.
-pub fn matched_localization_table(found: &MatchedLocalization) -> String {
+pub fn matched_localization_table(found: &MatchedLocalization) -> (Table, String) {
     let mut table = Table::new(
         "views | located by | answered | median m | 90 % m | median ° | 90 % ° | wrong | 68 % | 95 %",
     );
@@ -73,12 +73,13 @@ pub fn matched_localization_table(found: &MatchedLocalization) -> String {
     }
 
     let peer = peer_table(found);
-    format!(
-        "{table}\n{peer}wrong: answers over 0.2 m or 10 degrees off; near the map: a mapped view within 0.25 m and 15 degrees; \
+    let notes = format!(
+        "{peer}wrong: answers over 0.2 m or 10 degrees off; near the map: a mapped view within 0.25 m and 15 degrees; \
          near a prediction: the true pose off by up to 0.03 m and 2 degrees along each axis; \
          RMSE of the answers {:.4} m; {:.1} ms to match a view",
         found.all.ours.rmse_m, found.match_ms
-    )
+    );
+    (table, notes)
 }
 
 /// The parts of the views that are not empty, with their names.
@@ -163,7 +164,7 @@ fn peer_cells(method: &str, errors: &LocalizationErrors, shares: [String; 2]) ->
 
 /// One line per motion estimator: medians with intervals, and 90 % quantiles of the errors. The
 /// coverage of the two-view estimator follows.
-pub fn motion_table(found: &MotionEvaluation) -> String {
+pub fn motion_table(found: &MotionEvaluation) -> (Table, String) {
     let two_view = found.two_view.as_ref();
     let table = errors_table(
         "motion by",
@@ -183,20 +184,20 @@ pub fn motion_table(found: &MotionEvaluation) -> String {
         answered, coverage, ..
     }) = two_view
     else {
-        return table.to_string();
+        return (table, String::new());
     };
 
-    let mut text = format!(
-        "{table}\nmatched keypoints gave {:.1} % of the motions",
+    let mut notes = format!(
+        "matched keypoints gave {:.1} % of the motions",
         100.0 * answered
     );
     if *answered > 0.0 {
-        text += &format!(
+        notes += &format!(
             "; {:.2} and {:.2} of these lie within its 68 and 95 % ellipsoids",
             coverage.within_68, coverage.within_95
         );
     }
-    text
+    (table, notes)
 }
 
 fn errors_table(first: &str, rows: &[(&str, Option<LocalizationErrors>)]) -> Table {

@@ -6,6 +6,7 @@
 mod adapter_sweep;
 mod columns;
 mod cross_room;
+mod dot_plot;
 mod figure;
 mod document;
 mod evaluation;
@@ -31,9 +32,10 @@ pub use cross_room::{
     room_mean_text, rooms_table, scaling_table,
 };
 pub use document::{Block, Document, Picture, Section};
+pub use dot_plot::dot_plot;
 pub use evaluation::{
     AdapterJson, EvaluationContext, EvaluationJson, MotionBaselines, RoomJson, baselines_text,
-    evaluation_json, evaluation_table,
+    evaluation_json, evaluation_markdown, evaluation_table,
 };
 pub use evaluation_files::{
     curve_thresholds, evaluation_csv, evaluation_latex, hit_curves, report_at,

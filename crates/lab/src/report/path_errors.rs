@@ -17,8 +17,9 @@ pub const RPE_FORMULA: &str =
     "RPE: E_i = (ref_i⁻¹ ref_j)⁻¹ (est_i⁻¹ est_j), j = i + Δ poses; no alignment";
 
 /// One line per error and relation: root mean square, mean, median, standard deviation, smallest
-/// and largest value, and count. The formulas follow the table.
-pub fn path_errors_table(errors: &PathComparison) -> String {
+/// and largest value, and count; and the notes below the table: undefined errors
+/// and the formulas.
+pub fn path_errors_table(errors: &PathComparison) -> (Table, String) {
     let mut table = Table::new("error | part | rmse | mean | median | sd | least | largest | n");
 
     // Undefined errors are listed below the table, each with the reason.
@@ -39,7 +40,7 @@ pub fn path_errors_table(errors: &PathComparison) -> String {
         }
     }
 
-    format!("{table}\n{undefined}{APE_FORMULA}\n{RPE_FORMULA}")
+    (table, format!("{undefined}{APE_FORMULA}\n{RPE_FORMULA}"))
 }
 
 fn rows(errors: &PathComparison) -> Vec<(String, &Result<[Statistics; 3], Error>)> {

@@ -1,6 +1,7 @@
 //! The table of every report: a head and rows of text cells.
 
 use std::fmt;
+use std::ops::Range;
 
 /// A column of a table of `R`s.
 pub enum Column<R> {
@@ -25,7 +26,7 @@ impl<R> Column<R> {
 }
 
 /// A table. [`fmt::Display`] aligns it as text.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Table {
     /// The head, then the rows; a row may have fewer cells than the head.
     lines: Vec<Vec<String>>,
@@ -55,6 +56,16 @@ impl Table {
     pub fn row(&mut self, name: impl Into<String>, cells: impl IntoIterator<Item = String>) {
         let line = std::iter::once(name.into()).chain(cells);
         self.lines.push(line.collect());
+    }
+
+    /// The titles of the columns.
+    pub fn titles(&self) -> &[String] {
+        &self.lines[0]
+    }
+
+    /// The rows below the head.
+    pub fn rows(&self) -> &[Vec<String>] {
+        &self.lines[1..]
     }
 
     /// The cells of row `place`, from 0.
@@ -97,10 +108,45 @@ impl Table {
         format!("<table>\n{body}</table>\n")
     }
 
-    /// The table as comma-separated values; no cell may contain a comma.
+    /// The table as comma-separated values (RFC 4180).
     pub fn csv(&self) -> String {
-        let lines = self.lines.iter().map(|cells| cells.join(",") + "\n");
-        lines.collect()
+        let quoted = |cell: &String| {
+            let cell = cell.trim();
+            if cell.contains([',', '"', '\n']) {
+                format!("\"{}\"", cell.replace('"', "\"\""))
+            } else {
+                cell.to_owned()
+            }
+        };
+        let line = |cells: &Vec<String>| {
+            let cells: Vec<String> = cells.iter().map(quoted).collect();
+            cells.join(",") + "\n"
+        };
+        self.lines.iter().map(line).collect()
+    }
+
+    /// The table with its cells escaped for LaTeX.
+    pub fn escaped_for_latex(&self) -> Self {
+        let escaped = |cell: &String| {
+            let mut text = String::new();
+            for letter in cell.trim().chars() {
+                match letter {
+                    '&' | '%' | '$' | '#' | '_' | '{' | '}' => text.extend(['\\', letter]),
+                    '±' => text.push_str("$\\pm$"),
+                    '²' => text.push_str("$^2$"),
+                    '°' => text.push_str("$^\\circ$"),
+                    'ε' => text.push_str("$\\varepsilon$"),
+                    other => text.push(other),
+                }
+            }
+            text
+        };
+        let lines = self.lines.iter();
+        Self {
+            lines: lines
+                .map(|cells| cells.iter().map(escaped).collect())
+                .collect(),
+        }
     }
 
     /// The table as a LaTeX `tabular` for the package `booktabs`.
@@ -116,11 +162,31 @@ impl Table {
     }
 }
 
+/// The width of a terminal that every table fits, characters.
+const TERMINAL_WIDTH: usize = 100;
+
+/// Between two columns.
+const GAP: usize = 2;
+
 /// Every column is as wide as its widest cell. The first is left-aligned, the others are
-/// right-aligned. There is no line break after the last line.
+/// right-aligned. A table wider than 100 characters is folded: its columns follow in blocks, each of
+/// which begins with the first column. There is no line break after the last line.
 impl fmt::Display for Table {
     fn fmt(&self, to: &mut fmt::Formatter<'_>) -> fmt::Result {
-        // Widths are counted in characters, not in bytes: cells hold letters such as ², ° and –.
+        let widths = self.widths();
+        for (place, block) in blocks(&widths).into_iter().enumerate() {
+            if place > 0 {
+                to.write_str("\n\n")?;
+            }
+            self.write_block(to, &widths, block)?;
+        }
+        Ok(())
+    }
+}
+
+impl Table {
+    /// The width of each column, characters: cells hold letters such as ², ° and –.
+    fn widths(&self) -> Vec<usize> {
         let mut widths: Vec<usize> = Vec::new();
         for line in &self.lines {
             widths.resize(widths.len().max(line.len()), 0);
@@ -128,20 +194,47 @@ impl fmt::Display for Table {
                 *width = (*width).max(cell.chars().count());
             }
         }
+        widths
+    }
 
+    /// Writes the first column and the columns of `block`.
+    fn write_block(
+        &self,
+        to: &mut fmt::Formatter<'_>,
+        widths: &[usize],
+        block: Range<usize>,
+    ) -> fmt::Result {
         for (place, line) in self.lines.iter().enumerate() {
             let mut text = format!("{:1$}", line[0], widths[0]);
-            for (cell, width) in line.iter().zip(&widths).skip(1) {
-                text.push_str(&format!("  {cell:>width$}"));
+            for column in block.clone() {
+                let cell = line.get(column).map_or("", String::as_str);
+                text.push_str(&format!("  {cell:>0$}", widths[column]));
             }
 
             // A left-aligned or empty last cell leaves trailing blanks.
             let end = if place == 0 { "" } else { "\n" };
             write!(to, "{end}{}", text.trim_end())?;
         }
-
         Ok(())
     }
+}
+
+/// The columns after the first, in blocks that fit the terminal's width; at least one block, and at
+/// least one column in each if there is one.
+fn blocks(widths: &[usize]) -> Vec<Range<usize>> {
+    let mut blocks = Vec::new();
+    let mut start = 1;
+    let mut taken = widths[0];
+    for (column, width) in widths.iter().enumerate().skip(1) {
+        if taken + GAP + width > TERMINAL_WIDTH && column > start {
+            blocks.push(start..column);
+            start = column;
+            taken = widths[0];
+        }
+        taken += GAP + width;
+    }
+    blocks.push(start..widths.len().max(1));
+    blocks
 }
 
 /// Formats numbers with a fixed number of decimals.

@@ -1,6 +1,6 @@
 //! Verdicts on the paper's claims, and on ours, from the given rooms.
 
-use serde::{Serialize, Serializer};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use seese3_core::statistics::{Rate, RoomMean};
 
@@ -8,12 +8,12 @@ use crate::report::Column::{self, Text};
 use crate::report::{Section, Table};
 
 /// A claim and the evidence found for or against it.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Claim {
     /// The claim, one sentence.
-    pub claim: &'static str,
+    pub claim: String,
     /// Whether these rooms confirm it.
-    #[serde(serialize_with = "word")]
+    #[serde(serialize_with = "word", deserialize_with = "of_word")]
     pub verdict: Verdict,
     /// The evidence for the verdict, in words.
     pub found: String,
@@ -23,12 +23,20 @@ fn word<S: Serializer>(verdict: &Verdict, to: S) -> Result<S::Ok, S::Error> {
     to.serialize_str(verdict.word())
 }
 
+fn of_word<'de, D: Deserializer<'de>>(from: D) -> Result<Verdict, D::Error> {
+    let word = String::deserialize(from)?;
+    let verdict = Verdict::ALL
+        .into_iter()
+        .find(|verdict| verdict.word() == word);
+    verdict.ok_or_else(|| serde::de::Error::custom(format!("'{word}' is no verdict")))
+}
+
 impl Claim {
     /// A claim decided by one confidence interval per feature set; see [`Verdict::of_intervals`].
     /// `criterion` says when it holds for a feature set.
     pub fn over_feature_sets(claim: &'static str, criterion: &str, cases: &[Option<bool>]) -> Self {
         Self {
-            claim,
+            claim: claim.to_owned(),
             verdict: Verdict::of_intervals(cases),
             found: format!("{criterion}: {}", count_words(cases, "feature sets")),
         }
@@ -51,6 +59,15 @@ pub enum Verdict {
 }
 
 impl Verdict {
+    /// Every verdict.
+    const ALL: [Self; 5] = [
+        Self::Confirmed,
+        Self::Contradicted,
+        Self::Mixed,
+        Self::CannotTell,
+        Self::Untested,
+    ];
+
     /// Confirmed if the claim holds in every case, contradicted if it holds in no case.
     pub fn of(holds: &[bool]) -> Self {
         let held = holds.iter().filter(|&&holds| holds).count();
@@ -151,7 +168,7 @@ pub fn section(claims: &[Claim]) -> Section {
     let mut section = Section::new("The paper's claims in these rooms");
 
     let columns: [Column<Claim>; 3] = [
-        Text("claim", |claim| claim.claim.to_owned()),
+        Text("claim", |claim| claim.claim.clone()),
         Text("here", |claim| claim.verdict.word().to_owned()),
         Text("what was found", |claim| claim.found.clone()),
     ];

@@ -7,6 +7,7 @@ mod better;
 mod claims;
 mod cross;
 mod formulations;
+mod journal;
 mod navigation;
 mod notes;
 mod paper;
@@ -17,14 +18,18 @@ mod settings;
 mod strides;
 mod success;
 
+use journal::Kept;
+
 pub use claims::{Claim, Verdict};
+pub use journal::{Journal, NoJournal};
 pub use notes::{Notes, ReproducedAdapter, published_name};
 
 use std::collections::BTreeSet;
 
 use serde::Serialize;
+use serde_json::Value;
 
-use seese3_core::adapter::Preset;
+use seese3_core::adapter::{Adapter, Preset, TrainingRecord};
 use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
 use seese3_core::room::{FrameId, Room};
@@ -32,7 +37,6 @@ use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan};
 
 use crate::experiments::Error;
-use crate::experiments::adapter_sweep::SweepRow;
 use crate::report::{Document, Section, Table, TheoryJson, theory_json, theory_table};
 use crate::theory::{Effort, checks};
 
@@ -77,6 +81,8 @@ pub struct Reproduction<'a> {
     pub sets: Vec<FeatureSet<'a>>,
     /// Reads images for the pictures of walks; this crate reads no files.
     pub images: Images<'a>,
+    /// Keeps what is finished, so that an interrupted run goes on from there.
+    pub journal: &'a dyn Journal,
 }
 
 /// Functions of the caller that read and write images. Errors are reasons, in words.
@@ -102,16 +108,16 @@ pub struct Reproduced {
 /// published adapters and the run time.
 #[derive(Debug, Serialize)]
 pub struct ReproductionRecord {
-    probes: Vec<probes::ProbeRecord>,
-    strides: Vec<strides::StrideRecord>,
-    rooms_alone: Vec<SweepRow>,
-    settings: settings::SettingsRecord,
-    formulations: Vec<formulations::FormulationRecord>,
+    probes: Value,
+    strides: Value,
+    rooms_alone: Value,
+    settings: Value,
+    formulations: Value,
     navigation: Vec<navigation::NavigationRecord>,
     cross_room: Vec<cross::ZeroShotRecord>,
     better: Vec<better::BetterRecord>,
     pictures: Vec<pictures::WalkRecord>,
-    theory: TheoryJson,
+    theory: Value,
     claims: Vec<Claim>,
     protocol: ProtocolRecord,
 }
@@ -222,40 +228,47 @@ pub fn adapter_names(given: &Reproduction<'_>) -> Vec<String> {
     names
 }
 
-/// Runs the paper's experiments; `done` is called after each.
+/// Runs the paper's experiments. `begin` is called with the name of each before it.
+///
+/// What the journal of `given` has is not run again: finished experiments that train adapters of
+/// their own alone, and the adapters of the others.
 ///
 /// # Errors
-/// The [`Error`] of [`check`] or of the first failed experiment.
-pub fn reproduce(given: &Reproduction<'_>, done: &dyn Fn()) -> Result<Reproduced, Error> {
+/// The [`Error`] of [`check`] or of the first failed experiment; [`Error::Journal`] if the journal
+/// cannot be read or written.
+pub fn reproduce(
+    given: &Reproduction<'_>,
+    begin: &dyn Fn(&'static str),
+) -> Result<Reproduced, Error> {
     check(given)?;
 
     let mut notes = Notes::default();
-
-    let probes = probes::section(given, &mut notes.claims)?;
-    done();
-    let strides = strides::section(given, &mut notes.claims)?;
-    done();
-    let rooms_alone = success::section(given)?;
-    done();
-    let settings = settings::section(given)?;
-    done();
-    let formulations = formulations::section(given, &mut notes.claims)?;
-    done();
+    let claims = &mut notes.claims;
+    let kept = Kept {
+        journal: given.journal,
+        begin,
+    };
+    let probes = kept.step("probes", claims, |claims| probes::section(given, claims))?;
+    let strides = kept.step("strides", claims, |claims| strides::section(given, claims))?;
+    let rooms_alone = kept.step("rooms-alone", claims, |_| success::section(given))?;
+    let settings = kept.step("settings", claims, |_| settings::section(given))?;
+    let formulations = kept.step("formulations", claims, |claims| {
+        formulations::section(given, claims)
+    })?;
+    begin("navigation");
     let navigation = navigation::section(given, &mut notes)?;
-    done();
 
     // Adapters trained on several rooms, evaluated in held-out rooms.
+    begin("cross-room");
     let across = plans::evaluate(given, &mut notes)?;
     let cross_room = cross::section(given, &across, &mut notes.claims)?;
-    done();
+    begin("better");
     let better = better::section(&across, &mut notes.claims);
-    done();
 
     // The walks use the steady adapter trained for the previous sections.
+    begin("pictures");
     let pictures = pictures::section(given, &notes)?;
-    done();
-    let theory = theory()?;
-    done();
+    let theory = kept.step("theory", &mut notes.claims, |_| theory())?;
 
     // The verdicts are complete only now; place them near the top of the report, after the rooms.
     let mut sections = vec![rooms_and_features(given), claims::section(&notes.claims)];
@@ -299,6 +312,27 @@ pub fn reproduce(given: &Reproduction<'_>, done: &dyn Fn()) -> Result<Reproduced
 }
 
 impl Reproduction<'_> {
+    /// The adapter of `what`, a room or a plan: the kept one, else that of `train`, which is then
+    /// kept.
+    fn trained(
+        &self,
+        what: &str,
+        data: &RoomData<'_>,
+        train: impl FnOnce() -> Result<(Adapter, TrainingRecord), Error>,
+    ) -> Result<ReproducedAdapter, Error> {
+        let name = published_name(what, &data.features.source().name);
+        if let Some((adapter, record)) = self.journal.adapter(&name).map_err(Error::Journal)? {
+            return Ok(ReproducedAdapter::new(what, data, adapter, record));
+        }
+
+        let (adapter, record) = train()?;
+        let adapter = ReproducedAdapter::new(what, data, adapter, record);
+        self.journal
+            .keep_adapter(&adapter)
+            .map_err(Error::Journal)?;
+        Ok(adapter)
+    }
+
     /// The training plan of a preset at a stride. The number of epochs is the command's `--epochs`,
     /// else `epochs`, else the preset's own. Only the last has a minimum number of steps.
     fn plan(

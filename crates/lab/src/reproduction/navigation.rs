@@ -148,14 +148,15 @@ fn navigated(
 
     // Correctors are trained after the adapter, on the same pairs.
     plan.correctors = CorrectorKind::ALL.to_vec();
-    let (adapter, record) = train_adapter(&[*room], &plan, &mut |_| ())?;
-    let learned = ReproducedAdapter::new(room.room.id().as_str(), room, adapter.clone(), record);
+    let learned = given.trained(room.room.id().as_str(), room, || {
+        Ok(train_adapter(&[*room], &plan, &mut |_| ())?)
+    })?;
 
     // Use an exact index: scores must not depend on an approximation.
     let navigator = Navigator::new(
         Arc::new(room.room.clone()),
         room.features,
-        Arc::new(adapter),
+        Arc::new(learned.adapter.clone()),
         IndexKind::Exact,
     )?;
 

@@ -12,7 +12,8 @@ use seese3_core::training::{RoomData, TrainingPlan};
 use super::notes::{Notes, ReproducedAdapter};
 use super::{Error, FeatureSet, Reproduction};
 use crate::experiments::cross_room::{
-    CrossRoomPlan, CrossRoomProgress, CrossRoomRun, nested_choice, train_and_test,
+    CrossRoomPlan, CrossRoomProgress, CrossRoomRun, nested_choice, test_trained,
+    train_and_calibrate,
 };
 
 /// Number of adapters in an ensemble.
@@ -226,31 +227,23 @@ fn result_of(
         ..Protocol::paper(given.options.stride)
     };
 
-    let result = train_and_test(
-        &rooms,
-        &set.test,
-        &CrossRoomPlan {
-            training: &training_plan(given, plan.kind),
-            calibration_rooms,
-            protocol: &protocol,
-        },
-        &CrossRoomProgress {
-            epoch: &|| (),
-            room: &|| (),
-        },
-    )?;
-
-    let adapter = ReproducedAdapter::new(
-        &plan.adapter_name(),
-        &set.train[0],
-        result.adapter,
-        result.record,
-    );
-    let result = PlanResult {
-        plan,
-        run: result.run,
+    let training = training_plan(given, plan.kind);
+    let training = CrossRoomPlan {
+        training: &training,
+        calibration_rooms,
+        protocol: &protocol,
     };
-    Ok((result, adapter))
+    let progress = CrossRoomProgress {
+        epoch: &|| (),
+        room: &|| (),
+    };
+
+    let adapter = given.trained(&plan.adapter_name(), &set.train[0], || {
+        train_and_calibrate(&rooms, &training, &progress)
+    })?;
+    let trained = (adapter.adapter.clone(), adapter.record.clone());
+    let run = test_trained(trained, &rooms, &set.test, &training, &progress)?.run;
+    Ok((PlanResult { plan, run }, adapter))
 }
 
 fn training_plan(given: &Reproduction<'_>, kind: PlanKind) -> TrainingPlan {

@@ -91,7 +91,8 @@ pub fn section(
     let rooms = scored.iter().flat_map(|set| set.by_stride.iter().flatten());
     let positive: Vec<Option<bool>> = rooms.map(RoomScores::is_positive).collect();
     claims.push(Claim {
-        claim: "an adapter reads the motion of frames never seen, within a room (M4: R² > 0)",
+        claim: "an adapter reads the motion of frames never seen, within a room (M4: R² > 0)"
+            .to_owned(),
         verdict: Verdict::of_telling(&positive),
         found: format!(
             "mean R² is above 0: {}",

@@ -25,7 +25,7 @@ pub use fit::{FEWEST_MAPPED_FRAMES, FITTED_PRESET, FITTING_EPOCHS, FitRun, Fitte
 pub use hypotheses::{MotionHypotheses, MotionReader, PartRule};
 pub use localizer::{Localizer, LocatedView};
 pub use room_reader::RoomReader;
-pub use rules::{ReadingRule, ReadingRules};
+pub use rules::{ExpectedError, ReadingRule, ReadingRules};
 
 use seese3_core::room::{FrameId, Room};
 use seese3_core::{adapter, training};

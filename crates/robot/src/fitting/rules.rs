@@ -52,6 +52,19 @@ impl ReadingRule {
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReadingRules(Vec<ReadingRule>);
 
+/// The error that cross-validation leads to expect of views up to a distance from the map.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+pub struct ExpectedError {
+    /// Largest distance of the view's feature from the nearest mapped feature, in standard
+    /// deviations of a feature column.
+    pub feature_distance: f64,
+    /// Root mean square of the position error, meters.
+    pub translation_m: f64,
+    /// Root mean square of the rotation error, radians.
+    pub rotation_rad: f64,
+}
+
 /// Motion hypotheses for a held-out view with known pose.
 pub struct HeldOutView {
     /// Estimated motions from the mapped frame to the view.
@@ -102,6 +115,23 @@ impl ReadingRules {
     /// The rules, in order of increasing distance.
     pub fn rules(&self) -> &[ReadingRule] {
         &self.0
+    }
+
+    /// The expected errors at the median disagreement of the held-out views, nearest views first.
+    pub fn expected_errors(&self) -> Vec<ExpectedError> {
+        let expected = self.0.iter().map(|rule| {
+            // `least_disagreement` is a quarter of the median.
+            let median_disagreement = 4.0 * rule.least_disagreement;
+            let variances = rule
+                .covariance_at(rule.up_to, median_disagreement)
+                .diagonal();
+            ExpectedError {
+                feature_distance: rule.up_to,
+                translation_m: variances.fixed_rows::<3>(0).sum().sqrt(),
+                rotation_rad: variances.fixed_rows::<3>(3).sum().sqrt(),
+            }
+        });
+        expected.collect()
     }
 
     /// The rule for a view at this distance from the map.

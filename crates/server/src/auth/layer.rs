@@ -21,7 +21,7 @@ use super::super::status::Full;
 use super::{Keyring, Principal, Verb};
 
 /// The verb that an RPC requires, by path prefix; the first match counts.
-const VERBS: [(&str, Need); 10] = [
+const VERBS: [(&str, Need); 11] = [
     // Container and load balancer probes have no token.
     (HEALTH_CHECK, Need::Nothing),
     (HEALTH_WATCH, Need::Nothing),
@@ -35,6 +35,10 @@ const VERBS: [(&str, Need); 10] = [
     ("/seese3.v1.EvaluationService/", Need::Verb(Verb::Evaluate)),
     ("/seese3.v1.CatalogService/List", Need::Verb(Verb::Catalog)),
     ("/seese3.v1.CatalogService/Get", Need::Verb(Verb::Catalog)),
+    (
+        "/seese3.v1.CatalogService/Download",
+        Need::Verb(Verb::Download),
+    ),
     // All other catalog RPCs are changes.
     ("/seese3.v1.CatalogService/", Need::Verb(Verb::Write)),
 ];

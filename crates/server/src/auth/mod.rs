@@ -40,8 +40,10 @@ pub enum Verb {
     Track,
     /// EvaluationService.
     Evaluate,
-    /// Read access to CatalogService, and reflection.
+    /// Read access to CatalogService without downloads, and reflection.
     Catalog,
+    /// Downloads of rooms and adapters.
+    Download,
     /// Write access to CatalogService.
     Write,
 }

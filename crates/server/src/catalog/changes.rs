@@ -15,7 +15,7 @@ use super::super::metrics::Metrics;
 use super::super::reload::ReloadHandle;
 use super::super::shares::{Exhausted, Share, Shares};
 use super::super::snapshot::Snapshot;
-use super::super::status::Full;
+use super::super::status::{Full, Missing};
 use super::super::{Config, Error, Handlers, Phase};
 use super::recent::{Identity, Recent};
 use seese3_client::proto::v1 as pb;
@@ -23,8 +23,6 @@ use seese3_core::room::is_plain_name;
 use seese3_store::fit_stored_room;
 use seese3_store::{Kind, Published, Quota, Quotas, ResourceName, Scope, Store};
 
-/// Maximum length of free-text fields, characters.
-const LONGEST_WORDS: usize = 1_000;
 /// Maximum number of queued or running changes.
 const MOST_WAITING: usize = 64;
 
@@ -320,19 +318,6 @@ pub fn resource(kind: Kind, name: &str, revision: Option<u64>) -> Result<Resourc
     })
 }
 
-/// Checks the length of a free-text field.
-///
-/// # Errors
-/// [`Error::Invalid`] if it has more than [`LONGEST_WORDS`] characters.
-pub fn check_length(field: &str, words: &str) -> Result<(), Error> {
-    if words.chars().count() > LONGEST_WORDS {
-        let problem = format!("is longer than {LONGEST_WORDS} characters");
-        return Err(Error::invalid(field, problem));
-    }
-
-    Ok(())
-}
-
 /// Checks that the caller may change a resource. Adapters affect all rooms, so changing them
 /// requires access to all rooms.
 ///
@@ -366,31 +351,41 @@ impl From<seese3_store::Error> for Error {
         match &error {
             E::Unknown { kind, name, .. } => Self::NotStored {
                 field: (*kind).to_owned(),
-                name: name.clone(),
+                missing: Missing::of(kind, name),
+                problem: format!("'{name}' is not in the store"),
             },
             E::UnknownRevision {
                 kind,
                 name,
                 revision,
                 ..
-            } => Self::NotStored {
-                field: (*kind).to_owned(),
-                name: format!("{name} revision {revision}"),
-            },
-            E::UnknownFeatures { .. } | E::WhichFeatures { .. } => Self::invalid("features", error),
+            } => Self::no_revision(&format!("{kind}_revision"), name, *revision),
+            E::UnknownFeatures { .. } | E::WhichFeatures { .. } => {
+                Self::invalid("feature_set", error)
+            }
             E::Quota { .. } => Self::Quota {
                 problem: error.to_string(),
             },
-            E::Exists { kind, .. } => Self::Exists {
-                field: (*kind).to_owned(),
-                problem: error.to_string(),
+            E::Exists {
+                kind,
+                name,
+                revision,
+            } => Self::Exists {
+                field: format!("{kind}.mode"),
+                there: Missing::of(kind, name),
+                problem: format!(
+                    "{kind} '{name}' exists in revision {revision} with other content; send \
+                     UPLOAD_MODE_REPLACE for a new revision, or another name"
+                ),
             },
             E::InUse { .. } | E::NothingToTakeBack => Self::Precondition(error.to_string()),
             E::Contended { name } => Self::Conflict {
                 name: name.clone(),
                 problem: "was changed concurrently by other writers; retry".to_owned(),
             },
-            E::FeatureRows { .. } | E::DuplicateFeatures { .. } => Self::invalid("features", error),
+            E::FeatureRows { .. } | E::DuplicateFeatures { .. } => {
+                Self::invalid("feature_sources", error)
+            }
             E::Name { .. } => Self::invalid("name", error),
             E::CannotAdd { .. } => Self::invalid("frames", error),
             E::Absent { .. } => Self::Conflict {

@@ -12,6 +12,16 @@ use seese3_client::proto::v1 as pb;
 use seese3_store::{Choice, Cleared, Defaults, Kind, ResourceName};
 
 impl Handlers {
+    pub(super) async fn listed_defaults(
+        &self,
+        caller: &Requester,
+    ) -> Result<pb::ListDefaultsResponse, Error> {
+        let defaults = self.store.defaults().await?;
+        Ok(pb::ListDefaultsResponse {
+            defaults: defaults_to_wire(&defaults, caller.scope()),
+        })
+    }
+
     pub(super) async fn set(
         &self,
         caller: Requester,
@@ -69,9 +79,9 @@ impl Handlers {
 
         let required = || Error::invalid("default", "is required");
         let cleared = match default.ok_or_else(required)? {
-            Wire::RoomAdapter(room) => Cleared::AdapterOf { room },
-            Wire::RoomRevision(room) => Cleared::RevisionOf(ResourceName::room(room)),
-            Wire::AdapterRevision(adapter) => Cleared::RevisionOf(ResourceName::adapter(adapter)),
+            Wire::AdapterOfRoom(room) => Cleared::AdapterOf { room },
+            Wire::RevisionOfRoom(room) => Cleared::RevisionOf(ResourceName::room(room)),
+            Wire::RevisionOfAdapter(adapter) => Cleared::RevisionOf(ResourceName::adapter(adapter)),
         };
         check_right(&caller, &cleared.resource())?;
 

@@ -33,6 +33,10 @@ impl Handlers {
                 message_bytes: self.config.message_bytes as u64,
                 duration_s: self.config.longest.as_secs_f64(),
                 image_pixels: encoders.map_or(0, ImageEncoders::pixels),
+                request_pixels: encoders.map_or(0, |encoders| encoders.request_pixels),
+                answer_frames: limits.frames_in_answer.try_into().unwrap_or(u32::MAX),
+                upload_bytes: self.config.upload_bytes as u64,
+                streams: self.config.streams as u32,
             }),
         })
     }

@@ -4,9 +4,9 @@
 //! | --- | --- |
 //! | `changes` | common steps of all changes: one at a time, reload of the store, stored responses |
 //! | `recent` | stored responses to recent changes, for idempotent retries |
-//! | `keypoints_upload` | the keypoints of an uploaded room |
 //! | `room_upload` | uploads a room, in batches of frames |
 //! | `adapter_upload` | uploads an adapter |
+//! | `downloads` | downloads rooms and adapters |
 //! | `frames` | lists the frames of a room, for clients that plan or draw |
 //! | `refits` | fits an adapter to a room on the server |
 //! | `defaults` | sets and clears defaults, and removes revisions |
@@ -15,9 +15,9 @@
 mod adapter_upload;
 mod changes;
 mod defaults;
+mod downloads;
 mod frames;
 mod info;
-mod keypoints_upload;
 mod recent;
 mod refits;
 mod room_upload;
@@ -43,6 +43,8 @@ use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::catalog_service_server::CatalogService;
 use seese3_core::cancel::Cancellation;
 use seese3_core::geometry::Twist;
+use seese3_core::recording_extent::RecordingExtent;
+use seese3_robot::fitting::ExpectedError;
 use seese3_store::{RoomSummary, StoredAdapter};
 
 /// Default and maximum number of entries per page.
@@ -143,6 +145,24 @@ impl CatalogService for Handlers {
         self.unary(request, |_, _| Lane::Short, work).await
     }
 
+    type DownloadRoomStream = downloads::Messages<pb::DownloadRoomResponse>;
+
+    async fn download_room(
+        &self,
+        request: Request<pb::DownloadRoomRequest>,
+    ) -> Result<Response<Self::DownloadRoomStream>, Status> {
+        self.downloaded_room(request).await
+    }
+
+    type DownloadAdapterStream = downloads::Messages<pb::DownloadAdapterResponse>;
+
+    async fn download_adapter(
+        &self,
+        request: Request<pb::DownloadAdapterRequest>,
+    ) -> Result<Response<Self::DownloadAdapterStream>, Status> {
+        self.downloaded_adapter(request).await
+    }
+
     async fn upload_room(
         &self,
         request: Request<Streaming<pb::UploadRoomRequest>>,
@@ -181,6 +201,14 @@ impl CatalogService for Handlers {
         let (events, heard) = mpsc::channel(16);
         tokio::spawn(self.clone().run_refit(admitted, context, events));
         Ok(Response::new(ReceiverStream::new(heard)))
+    }
+
+    async fn list_defaults(
+        &self,
+        request: Request<pb::ListDefaultsRequest>,
+    ) -> Result<Response<pb::ListDefaultsResponse>, Status> {
+        let answer = self.listed_defaults(&Requester::of(&request)).await?;
+        respond(answer)
     }
 
     async fn set_default(
@@ -274,25 +302,51 @@ fn room(snapshot: &Snapshot, served: &ServedRoom) -> pb::Room {
         created,
         frame_count,
         features,
-        keypoints: _,
+        keypoints,
         provenance,
+        extent,
     } = &served.summary;
+    let adapters = snapshot.adapters_of(served);
+    let fit = adapters.iter().find_map(|adapter| {
+        let fit = adapter.room_fit.as_ref()?;
+        (fit.room == served.id).then_some(fit)
+    });
+    let expected_errors = fit.map_or_else(Vec::new, |fit| fit.rules.expected_errors());
 
     pb::Room {
         name: room.clone(),
         revision: *revision,
         frame_count: *frame_count as u32,
-        adapters: snapshot
-            .adapters_of(served)
+        adapters: adapters
             .iter()
             .map(|adapter| adapter.name.clone())
             .collect(),
-        features: features.iter().map(convert::source_to_wire).collect(),
+        feature_sources: features.iter().map(convert::source_to_wire).collect(),
         format: provenance.format.clone(),
         license: provenance.licence.clone(),
-        worst_rotation_deviation: provenance.worst_rotation_deviation,
+        worst_rotation_error: provenance.worst_rotation_deviation,
         create_time: convert::time_to_wire(created),
         camera: provenance.camera.as_ref().map(convert::camera_to_wire),
+        extent: extent.as_ref().map(extent_to_wire),
+        duration_s: extent.and_then(|extent| extent.duration_s),
+        frame_rate_hz: extent.and_then(|extent| extent.frame_rate_hz),
+        has_keypoints: keypoints.is_some(),
+        expected_errors: expected_errors.iter().map(expected_to_wire).collect(),
+    }
+}
+
+fn extent_to_wire(extent: &RecordingExtent) -> pb::Extent {
+    pb::Extent {
+        min: Some(convert::vector_to_wire(&extent.min.into())),
+        max: Some(convert::vector_to_wire(&extent.max.into())),
+    }
+}
+
+fn expected_to_wire(expected: &ExpectedError) -> pb::ExpectedError {
+    pb::ExpectedError {
+        feature_distance: expected.feature_distance,
+        translation_m: expected.translation_m,
+        rotation_rad: expected.rotation_rad,
     }
 }
 
@@ -319,7 +373,7 @@ fn adapter(stored: &StoredAdapter, scope: Option<&RoomScope>) -> pb::Adapter {
     pb::Adapter {
         name: stored.name.clone(),
         revision: stored.revision,
-        source: Some(convert::source_to_wire(adapter.source())),
+        feature_source: Some(convert::source_to_wire(adapter.source())),
         latent_dim: adapter.latent_dim() as u32,
         training_rooms: revisions(&record.rooms, scope),
         preset: record.preset.clone(),

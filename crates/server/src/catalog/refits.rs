@@ -52,7 +52,7 @@ impl Handlers {
         let pb::FitAdapterRequest {
             room,
             base_adapter,
-            features,
+            feature_set,
             fitted_adapter,
             seed,
             request_id: _,
@@ -89,7 +89,7 @@ impl Handlers {
             base,
             name: fitted_adapter,
             own_names_only: caller.scope().is_some_and(|scope| !scope.is_all()),
-            features: (!features.is_empty()).then_some(features),
+            features: (!feature_set.is_empty()).then_some(feature_set),
             room: room.name,
             seed,
         };

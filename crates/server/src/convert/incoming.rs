@@ -2,7 +2,7 @@
 
 use super::super::Error;
 use super::super::snapshot::Snapshot;
-use super::{CAMERA, world_frame};
+use super::{CAMERA, MAP, world_frame};
 use seese3_client::convert::{self, ConvertError};
 use seese3_client::proto::v1 as pb;
 use seese3_core::eval::{PredictedPair, Prediction, check_thresholds, default_thresholds};
@@ -10,15 +10,30 @@ use seese3_core::features::UNSPECIFIED;
 use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera, Pose, Twist};
 use seese3_core::navigation::NavigatorKind;
 use seese3_core::navigation::{
-    Displacement, FitOn, MAX_TRANSLATION_M, Mode, Query, Reading, RetrievalMetric, Source,
+    FitOn, MAX_TRANSLATION_M, Mode, Query, Reading, RequestedMotion, RetrievalMetric, Source,
     SourceAt, StepKind,
 };
 use seese3_core::room::FrameId;
 use seese3_core::splits::{Pair, Split};
 use seese3_store::StoredAdapter;
 
+/// Maximum length of free-text fields, characters.
+const LONGEST_WORDS: usize = 1_000;
 /// The largest number of navigators in one evaluation.
 const MAX_NAVIGATORS: usize = 100;
+
+/// Checks the length of a free-text field.
+///
+/// # Errors
+/// [`Error::Invalid`] if it has more than [`LONGEST_WORDS`] characters.
+pub fn check_length(field: &str, words: &str) -> Result<(), Error> {
+    if words.chars().count() > LONGEST_WORDS {
+        let problem = format!("is longer than {LONGEST_WORDS} characters");
+        return Err(Error::invalid(field, problem));
+    }
+
+    Ok(())
+}
 
 pub fn twist(twist: pb::Twist) -> Result<Twist, Error> {
     let convert::Twist { linear, angular } = convert::twist(&twist)?;
@@ -44,9 +59,10 @@ pub fn pose(pose: pb::Pose, room: &str) -> Result<Pose, Error> {
         orientation,
     } = pose;
 
-    // Empty names mean the room's world and the camera. The server knows no other frames.
+    // Empty names mean the room's world and the camera, as does the default name of the map frame in
+    // Track. The server knows no other frames.
     let world = world_frame(room);
-    if !parent_frame.is_empty() && parent_frame != world {
+    if ![String::new(), MAP.to_owned(), world.clone()].contains(&parent_frame) {
         return Err(Error::invalid(
             "parent_frame",
             format!("'{parent_frame}' is not the room's world, '{world}'"),
@@ -105,6 +121,43 @@ pub fn camera(camera: &pb::CameraIntrinsics) -> Result<CameraIntrinsics, Error> 
     .map_err(|problem| Error::invalid("camera", problem))
 }
 
+/// The camera of a request's images.
+#[derive(Debug, Clone, Copy)]
+pub enum ImageCamera {
+    /// A camera with these intrinsics.
+    Stated(CameraIntrinsics),
+    /// The camera that mapped the room.
+    Mapping,
+}
+
+/// The camera of a request's images.
+///
+/// # Errors
+/// [`Error::Invalid`] on a part of `field` if the camera is not valid, or none is given.
+pub fn image_camera(field: &str, given: &pb::ViewCamera) -> Result<ImageCamera, Error> {
+    use pb::view_camera::Camera;
+
+    match &given.camera {
+        Some(Camera::Intrinsics(intrinsics)) => match camera(intrinsics) {
+            Ok(camera) => Ok(ImageCamera::Stated(camera)),
+            // The field begins with `camera`, as in other requests.
+            Err(Error::Invalid {
+                field: part,
+                problem,
+            }) => {
+                let part = part.strip_prefix("camera").unwrap_or_default();
+                Err(Error::invalid(format!("{field}.intrinsics{part}"), problem))
+            }
+            Err(other) => Err(other),
+        },
+        Some(Camera::MappingCamera(pb::MappingCamera {})) => Ok(ImageCamera::Mapping),
+        None => Err(Error::invalid(
+            field,
+            "has no value: state the intrinsics, or mapping_camera",
+        )),
+    }
+}
+
 /// The lens distortion of a model and its coefficients.
 fn distortion(model: i32, coefficients: &[f64]) -> Result<Distortion, Error> {
     let count = coefficients.len();
@@ -159,17 +212,17 @@ pub fn source(
         Some(pb::view::View::FrameId(frame)) => Ok(Source::Frame(FrameId(frame))),
         Some(pb::view::View::Feature(pb::Feature {
             values,
-            source_name,
+            feature_set,
         })) => {
             let own = &adapter.adapter.source().name;
 
             // Features of different sources are not comparable, even if their width is the same. If
             // the caller states the source, check it.
-            if !source_name.is_empty() && source_name != *own {
+            if !feature_set.is_empty() && feature_set != *own {
                 let problem =
-                    format!("'{source_name}' is not '{own}', which the adapter was trained on");
+                    format!("'{feature_set}' is not '{own}', which the adapter was trained on");
                 return Err(Error::invalid(
-                    format!("{field}.feature.source_name"),
+                    format!("{field}.feature.feature_set"),
                     problem,
                 ));
             }
@@ -253,32 +306,31 @@ pub fn adapter_of_latents<'a>(
     }
 }
 
-fn displacement(displacement: Option<pb::Displacement>, room: &str) -> Result<Displacement, Error> {
-    use pb::displacement::Displacement as Wire;
+fn requested_motion(
+    given: Option<pb::RequestedMotion>,
+    room: &str,
+) -> Result<RequestedMotion, Error> {
+    use pb::requested_motion::Motion as Wire;
 
-    let wire = displacement.and_then(|displacement| displacement.displacement);
-    match wire
-        .ok_or_else(|| Error::invalid("displacement", "is required: a twist, a target or twists"))?
-    {
+    let required = || Error::invalid("motion", "is required: a twist, a target or twists");
+    match given.and_then(|given| given.motion).ok_or_else(required)? {
         Wire::Twist(given) => {
-            let given = twist(given).map_err(|error| error.within("displacement.twist"))?;
-            Ok(Displacement::Twists(vec![given]))
+            let given = twist(given).map_err(|error| error.within("motion.twist"))?;
+            Ok(RequestedMotion::Twists(vec![given]))
         }
-        Wire::TargetFrameId(frame) => Ok(Displacement::TargetFrame(FrameId(frame))),
+        Wire::TargetFrameId(frame) => Ok(RequestedMotion::TargetFrame(FrameId(frame))),
         Wire::TargetPose(target) => {
-            let target =
-                pose(target, room).map_err(|error| error.within("displacement.target_pose"))?;
-            Ok(Displacement::TargetPose(target))
+            let target = pose(target, room).map_err(|error| error.within("motion.target_pose"))?;
+            Ok(RequestedMotion::TargetPose(target))
         }
         Wire::Twists(pb::TwistList { twists }) => {
             let numbered = twists.into_iter().enumerate();
 
             let each = |(position, given)| {
-                twist(given)
-                    .map_err(|error| error.within(&format!("displacement.twists[{position}]")))
+                twist(given).map_err(|error| error.within(&format!("motion.twists[{position}]")))
             };
 
-            Ok(Displacement::Twists(
+            Ok(RequestedMotion::Twists(
                 numbered.map(each).collect::<Result<_, _>>()?,
             ))
         }
@@ -302,7 +354,7 @@ pub fn query(
         adapter_revision: _,
         source: view,
         source_pose,
-        displacement: wanted,
+        motion,
         steps,
         step_mode,
         inverse_variant,
@@ -312,7 +364,7 @@ pub fn query(
         navigator,
     } = request;
 
-    let displacement = displacement(wanted, &room)?;
+    let motion = requested_motion(motion, &room)?;
     let (step, metric) = step_of(&navigator, inverse_variant)?;
 
     let mode = mode_of(step_mode)?;
@@ -335,7 +387,7 @@ pub fn query(
             source,
             pose: source_pose,
         },
-        displacement,
+        motion,
         steps: steps.unwrap_or(1),
         mode,
         step,
@@ -480,7 +532,7 @@ pub fn layer_index_base(given: i32) -> Result<String, Error> {
         Ok(pb::LayerIndexBase::Name) => "name",
         Err(_) => {
             let problem = format!("{given} is not known to this server");
-            return Err(Error::invalid("features.layer_index_base", problem));
+            return Err(Error::invalid("feature_sources.layer_index_base", problem));
         }
     };
     Ok(base.to_owned())
@@ -497,7 +549,7 @@ pub fn final_norm(given: i32) -> Result<String, Error> {
         Ok(pb::FinalNorm::Applied) => "final",
         Err(_) => {
             let problem = format!("{given} is not known to this server");
-            return Err(Error::invalid("features.final_norm", problem));
+            return Err(Error::invalid("feature_sources.final_norm", problem));
         }
     };
     Ok(norm.to_owned())

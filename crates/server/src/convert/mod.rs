@@ -5,13 +5,16 @@ mod incoming;
 mod outgoing;
 
 pub use incoming::{
-    adapter_of_latents, camera, exclusion, final_norm, layer_index_base, mode_of, navigators, pose,
-    prediction, query, source, split, stated_adapter, thresholds,
+    ImageCamera, adapter_of_latents, camera, check_length, exclusion, final_norm, image_camera,
+    layer_index_base, mode_of, navigators, pose, prediction, query, source, split, stated_adapter,
+    thresholds,
 };
 pub use outgoing::*;
 
 /// Default child frame of poses; a Track stream may choose another name.
 const CAMERA: &str = "camera";
+/// Default name of the map frame of a Track stream.
+pub const MAP: &str = "map";
 
 /// The name of a room's world frame, the parent frame of its poses.
 pub fn world_frame(room: &str) -> String {

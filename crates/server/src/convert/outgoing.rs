@@ -221,7 +221,7 @@ pub fn scores_to_wire(scores: &MotionScores) -> pb::MotionScores {
     // R² is NaN if the true motions do not vary; the field is then absent.
     let known = |value: f64| value.is_finite().then_some(value);
     pb::MotionScores {
-        n: scores.n as u32,
+        pair_count: scores.n as u32,
         overall: known(scores.overall),
         translation: known(scores.translation),
         rotation: known(scores.rotation),
@@ -247,7 +247,7 @@ pub fn row_to_wire(row: &Row) -> pb::NavigatorScores {
 
     pb::NavigatorScores {
         name: row.name.clone(),
-        n: row.n as u32,
+        pair_count: row.n as u32,
         latent_mse: row.latent.map(|latent| latent.mse),
         latent_r2: row
             .latent
@@ -268,7 +268,7 @@ pub fn row_to_wire(row: &Row) -> pb::NavigatorScores {
             .iter()
             .map(|recall| pb::PoseRecall {
                 translation_m: recall.translation_m,
-                rotation_deg: recall.rotation_deg,
+                rotation_rad: recall.rotation_deg.to_radians(),
                 proportion: Some(proportion_to_wire(&recall.rate)),
             })
             .collect(),

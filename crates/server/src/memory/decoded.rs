@@ -275,7 +275,7 @@ mod tests {
         // 1,000 packed floats: 4 bytes each on the wire, times the list growth.
         let feature = pb::Feature {
             values: vec![1.0; 1_000],
-            source_name: String::new(),
+            feature_set: String::new(),
         };
         let request = pb::NavigateRequest {
             source: Some(pb::View {

@@ -331,7 +331,8 @@ impl Snapshot {
             }
             (_, Some(first)) => Ok(first),
             (_, None) => Err(Error::Precondition(format!(
-                "no adapter fits room '{id}'; train one"
+                "no adapter fits room '{id}'; fit one with FitAdapter or `seese3 fit`, or upload one for its \
+                 features"
             ))),
         }
     }

@@ -5,11 +5,11 @@ use std::sync::Arc;
 use nalgebra::Matrix6;
 
 use super::super::Error;
-use super::super::convert;
+use super::super::convert::{self, ImageCamera};
 use super::super::relocalization::rooms_to_track_in;
 use super::super::snapshot::{ServedNavigator, Snapshot};
 use seese3_client::proto::v1 as pb;
-use seese3_core::geometry::{Pose, adjoint};
+use seese3_core::geometry::{CameraIntrinsics, Pose, adjoint};
 use seese3_robot::pose_filter::FilterParameters;
 use seese3_robot::tracking::{Drift, MeasuredPose, PoseWithCovariance};
 
@@ -20,7 +20,7 @@ const DEVIATIONS: std::ops::RangeInclusive<f64> = 1e-6..=1e3;
 /// Largest asymmetry and negative eigenvalue of a covariance, relative to its largest entry.
 const ASYMMETRY: f64 = 1e-6;
 /// Default names of the map, odometry, camera and base frames.
-const FRAME_NAMES: [&str; 4] = ["map", "odom", "camera", "base_link"];
+const FRAME_NAMES: [&str; 4] = [convert::MAP, "odom", "camera", "base_link"];
 /// Maximum length of a frame name, bytes.
 pub const LONGEST_NAME: usize = 100;
 /// Default drift of another sensor's odometry: meters per meter, radians per radian and per meter.
@@ -39,13 +39,16 @@ pub fn rooms(
     config: &pb::TrackConfig,
 ) -> Result<Vec<Arc<ServedNavigator>>, Error> {
     let mut served = named_rooms(snapshot, config)?;
-    if let Some(camera) = &config.camera {
-        served = with_matching_camera(camera, served)?;
+    let camera = config.camera.as_ref();
+    let camera = camera.map(|camera| convert::image_camera("camera", camera));
+    if let Some(ImageCamera::Stated(camera)) = camera.transpose()? {
+        served = with_matching_camera("camera", &camera, served)?;
     }
     for (number, other) in config.other_cameras.iter().enumerate() {
-        if let Some(camera) = &other.camera {
-            served = with_matching_camera(camera, served)
-                .map_err(|error| error.within(&format!("other_cameras[{number}]")))?;
+        if let Some(intrinsics) = &other.intrinsics {
+            let field = format!("other_cameras[{number}].intrinsics");
+            let camera = convert::camera(intrinsics).map_err(|error| error.named(&field))?;
+            served = with_matching_camera(&field, &camera, served)?;
         }
     }
 
@@ -99,22 +102,25 @@ pub fn parameters(
     fitted: FilterParameters,
 ) -> Result<FilterParameters, Error> {
     let pb::KeyframePolicy {
-        displacement,
-        frames,
+        motion_norm,
+        sequence_interval,
     } = config.keyframes.unwrap_or_default();
-    if displacement.is_some_and(|given| !(given.is_finite() && given > 0.0)) {
+    if motion_norm.is_some_and(|given| !(given.is_finite() && given > 0.0)) {
         return Err(Error::invalid(
-            "keyframes.displacement",
+            "keyframes.motion_norm",
             "must be finite and above 0",
         ));
     }
-    if frames == Some(0) {
-        return Err(Error::invalid("keyframes.frames", "must be at least 1"));
+    if sequence_interval == Some(0) {
+        return Err(Error::invalid(
+            "keyframes.sequence_interval",
+            "must be at least 1",
+        ));
     }
 
     Ok(FilterParameters {
-        keyframe_frames: frames.unwrap_or(fitted.keyframe_frames),
-        keyframe_displacement: displacement.unwrap_or(fitted.keyframe_displacement),
+        keyframe_frames: sequence_interval.unwrap_or(fitted.keyframe_frames),
+        keyframe_displacement: motion_norm.unwrap_or(fitted.keyframe_displacement),
         fuse: is_fused(config.fusion)?,
         trust_wheels: config.trust_odometry,
         ..fitted
@@ -124,19 +130,19 @@ pub fn parameters(
 /// The rooms mapped with the same field of view as this camera, or with an unknown camera.
 ///
 /// # Errors
-/// [`Error::Invalid`] if the camera is not valid, or no room is left.
+/// [`Error::Invalid`] on `field` if no room is left.
 fn with_matching_camera(
-    camera: &pb::CameraIntrinsics,
+    field: &str,
+    camera: &CameraIntrinsics,
     served: Vec<Arc<ServedNavigator>>,
 ) -> Result<Vec<Arc<ServedNavigator>>, Error> {
-    let camera = convert::camera(camera)?;
     let mut other = None;
     let mut alike = Vec::new();
 
     for served in served {
         let room = served.navigator.room();
         let of_room = room.provenance().camera.as_ref();
-        match of_room.and_then(|of_room| of_room.difference(&camera)) {
+        match of_room.and_then(|of_room| of_room.difference(camera)) {
             None => alike.push(served),
             Some(difference) => other = Some((room.id().to_string(), difference)),
         }
@@ -144,7 +150,7 @@ fn with_matching_camera(
 
     match other {
         Some((room, difference)) if alike.is_empty() => Err(Error::invalid(
-            "camera",
+            field,
             format!(
                 "{difference} ('{room}'): crop or pad the images to that, or map with this camera"
             ),
@@ -187,7 +193,10 @@ impl StreamFrames {
     /// [`Error::Invalid`] for a name that is too long or used twice, and for an invalid pose.
     pub fn of(config: &pb::TrackConfig) -> Result<Self, Error> {
         let given = config.base_from_camera.clone();
-        let names = frame_names(config.frames.clone().unwrap_or_default(), given.is_some())?;
+        let names = frame_names(
+            config.frame_names.clone().unwrap_or_default(),
+            given.is_some(),
+        )?;
         let base_from_camera = given
             .map(|mut pose| {
                 clear_name(&mut pose.parent_frame, &names.base);
@@ -215,7 +224,7 @@ impl StreamFrames {
     ) -> Result<PoseWithCovariance, Error> {
         let pb::InitialPose {
             pose,
-            translation_deviation_m,
+            position_deviation_m,
             rotation_deviation_rad,
         } = given;
         let mut pose = pose.ok_or_else(|| Error::invalid("pose", "is required"))?;
@@ -228,7 +237,7 @@ impl StreamFrames {
 
         let deviation =
             |field: &str, given: Option<f64>| within(field, given.unwrap_or(KNOWN), DEVIATIONS);
-        let translation = deviation("translation_deviation_m", translation_deviation_m)?;
+        let translation = deviation("position_deviation_m", position_deviation_m)?;
         let rotation = deviation("rotation_deviation_rad", rotation_deviation_rad)?;
 
         Ok(self.of_camera(PoseWithCovariance::known(pose, translation, rotation), body))
@@ -391,7 +400,7 @@ fn frame_names(given: pb::FrameNames, has_base: bool) -> Result<pb::FrameNames, 
         }
         if name.len() > LONGEST_NAME || name.chars().any(char::is_control) {
             let problem = format!("is over {LONGEST_NAME} bytes long or has a control character");
-            return Err(Error::invalid(format!("frames.{field}"), problem));
+            return Err(Error::invalid(format!("frame_names.{field}"), problem));
         }
     }
 
@@ -402,7 +411,7 @@ fn frame_names(given: pb::FrameNames, has_base: bool) -> Result<pb::FrameNames, 
     different.dedup();
     if different.len() != used.len() {
         return Err(Error::invalid(
-            "frames",
+            "frame_names",
             format!("must be {} different names", used.len()),
         ));
     }

@@ -202,11 +202,17 @@ fn noise(given: &pb::InertialSensor) -> Result<InertialNoise, Error> {
             )?,
         ],
         bias: [
-            of(0, "gyroscope_bias", given.gyroscope_bias, bias, &NOISES)?,
+            of(
+                0,
+                "gyroscope_bias_deviation",
+                given.gyroscope_bias_deviation,
+                bias,
+                &NOISES,
+            )?,
             of(
                 1,
-                "accelerometer_bias",
-                given.accelerometer_bias,
+                "accelerometer_bias_deviation",
+                given.accelerometer_bias_deviation,
                 bias,
                 &NOISES,
             )?,

@@ -1,8 +1,9 @@
 //! Matches the images of a stream with the keypoints of its rooms.
 
+use super::super::Error;
+use super::super::convert::{self, ImageCamera};
 use super::super::embedding::ImageKeypoints;
 use super::super::image_view::check_aspect;
-use super::super::{Error, convert};
 use super::rooms::TrackedRoom;
 use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::Pose;
@@ -87,15 +88,13 @@ impl StreamRooms<'_> {
 /// The camera of a configuration.
 ///
 /// # Errors
-/// [`Error::Invalid`] on `camera` or `mapping_camera`.
+/// [`Error::Invalid`] on `camera`.
 pub fn stream_camera(config: &pb::TrackConfig) -> Result<StreamCamera, Error> {
-    match (&config.camera, config.mapping_camera) {
-        (Some(_), true) => Err(Error::invalid(
-            "mapping_camera",
-            "is set together with camera; set only one of them",
-        )),
-        (Some(camera), false) => Ok(StreamCamera::Stated(convert::camera(camera)?)),
-        (None, true) => Ok(StreamCamera::Mapping),
-        (None, false) => Ok(StreamCamera::unknown()),
-    }
+    let Some(camera) = &config.camera else {
+        return Ok(StreamCamera::unknown());
+    };
+    Ok(match convert::image_camera("camera", camera)? {
+        ImageCamera::Stated(camera) => StreamCamera::Stated(camera),
+        ImageCamera::Mapping => StreamCamera::Mapping,
+    })
 }

@@ -146,7 +146,7 @@ impl Sensors {
                 [] => "is unknown: the configuration has no other_cameras".to_owned(),
                 known => format!("must be one of: {}", known.join(", ")),
             };
-            Error::invalid("camera", problem)
+            Error::invalid("camera_name", problem)
         })?;
 
         let other = &self.other_cameras[number];
@@ -179,7 +179,7 @@ impl Sensors {
             .ok_or_else(|| Error::invalid("direction", "is required"))?;
         let measured = direction("direction", measured)?;
 
-        let frame = given.frame.as_str();
+        let frame = given.coordinate_frame.as_str();
         let in_camera = match self.base_from_camera {
             Some(base_from_camera) if frame.is_empty() || frame == self.base => {
                 base_from_camera.rotation.inverse() * measured
@@ -190,7 +190,7 @@ impl Sensors {
                     Some(_) => format!("must be {} or {}", self.base, self.camera),
                     None => format!("must be {}: the base is not known", self.camera),
                 };
-                return Err(Error::invalid("frame", problem));
+                return Err(Error::invalid("coordinate_frame", problem));
             }
         };
 

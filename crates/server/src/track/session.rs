@@ -89,8 +89,9 @@ impl Session {
 
         let mut session = Self::configured(snapshot, config, key, sealed.is_of_keypoints())
             .map_err(|error| match error {
-                Error::NotFound { name, .. } => {
-                    Error::Precondition(format!("{field}: '{name}' is not served here"))
+                Error::NotFound { missing, .. } => {
+                    let problem = format!("{field}: '{}' is not served here", missing.name);
+                    Error::Precondition(problem)
                 }
                 other => other,
             })?;
@@ -195,10 +196,10 @@ impl Session {
     /// The first answer of a stream: adapter, room, frame names and keyframe policy in effect.
     pub fn started(&self) -> pb::TrackResponse {
         let parameters = self.engine.filter.parameters();
-        let displacement = parameters.keyframe_displacement;
+        let motion_norm = parameters.keyframe_displacement;
         let keyframes = pb::KeyframePolicy {
-            displacement: displacement.is_finite().then_some(displacement),
-            frames: Some(parameters.keyframe_frames),
+            motion_norm: motion_norm.is_finite().then_some(motion_norm),
+            sequence_interval: Some(parameters.keyframe_frames),
         };
 
         let served = self.rooms[0].served.as_ref();
@@ -206,7 +207,7 @@ impl Session {
         let started = pb::TrackStarted {
             adapter: served.map(|served| convert::adapter_revision(served)),
             room: self.room().map(|room| room.revision.clone()),
-            frames: Some(self.frames.names.clone()),
+            frame_names: Some(self.frames.names.clone()),
             keyframes: Some(keyframes),
             calibration_rooms: calibrated_on as u32,
             has_visual_odometry: self.front_end.has_odometry(),
@@ -242,7 +243,7 @@ impl Session {
                     .map_or_else(String::new, |number| self.sensors.camera_name(number));
                 let mut update = wire::update(&update, &self.frames, &self.rooms);
                 if let Some(found) = &mut update.r#match {
-                    found.camera = camera;
+                    found.camera_name = camera;
                 }
 
                 // Measured from the frame's arrival, including the wait for a thread.
@@ -262,7 +263,7 @@ impl Session {
                     sequence_number,
                     reason: reason as i32,
                     message,
-                    frames: 1,
+                    frame_count: 1,
                 })
             }
             Err(Refused::Server(error)) => return Err(error),
@@ -297,7 +298,7 @@ impl Session {
             sequence_number,
             reason: pb::TrackRefusalReason::Superseded as i32,
             message: "a newer frame arrived before this one was processed".to_owned(),
-            frames,
+            frame_count: frames,
         });
 
         if self.is_token_due(sequence_number) {
@@ -462,11 +463,11 @@ impl Session {
             let field = format!("frame.other_views[{number}]");
             let camera = self
                 .sensors
-                .other_camera(&given.camera, velocity)
+                .other_camera(&given.camera_name, velocity)
                 .map_err(|error| error.within(&field))?;
             if seen.iter().any(|(other, _)| other.number == camera.number) {
                 return Err(Error::invalid(
-                    format!("{field}.camera"),
+                    format!("{field}.camera_name"),
                     "is the same camera twice",
                 ));
             }

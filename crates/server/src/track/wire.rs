@@ -111,7 +111,7 @@ fn match_to_wire(update: &Update, rooms: &[TrackedRoom]) -> pb::TrackMatch {
         frame: best.map(|best| rooms[best.room].retrieved(best.frame)),
         used: update.match_used,
         mahalanobis_squared: update.surprise,
-        camera: String::new(),
+        camera_name: String::new(),
     }
 }
 

@@ -29,7 +29,10 @@ fn compare(what: &str, scores: &pb::NavigatorScores, expected: &serde_json::Valu
 }
 
 fn compare_hits(what: &str, scores: &pb::NavigatorScores, included: &serde_json::Value) {
-    assert_eq!(u64::from(scores.n), included["n"].as_u64().unwrap());
+    assert_eq!(
+        u64::from(scores.pair_count),
+        included["n"].as_u64().unwrap()
+    );
 
     for (found, key, bound) in [
         (scores.top1.unwrap().value, "top1", 1e-12),
@@ -69,7 +72,7 @@ async fn evaluate_streams_progress_and_the_oracles_table() {
     let names: Vec<&str> = rows.iter().map(|row| row.name.as_str()).collect();
     assert_eq!(begun, names);
 
-    assert_eq!((report.n, report.candidate_count), (80, 120));
+    assert_eq!((report.pair_count, report.candidate_count), (80, 120));
     assert!(report.in_room && !report.leaks);
 
     let expected = expected();
@@ -111,7 +114,7 @@ async fn walks_that_snap_can_be_handed_in() {
     for source in 0..600 - stride {
         let walk = |r: &mut pb::NavigateRequest| {
             r.source = frame(source);
-            r.displacement = to_frame(source + stride);
+            r.motion = to_frame(source + stride);
             r.navigator = "inverse-poincare-affine".to_owned();
             r.steps = Some(steps);
             r.step_mode = pb::StepMode::Snap.into();
@@ -143,7 +146,7 @@ async fn walks_that_snap_can_be_handed_in() {
     let scored = scored.await.unwrap().scores.unwrap();
 
     let expected = &report.navigators[0];
-    assert_eq!((scored.n, expected.n), (560, 560));
+    assert_eq!((scored.pair_count, expected.pair_count), (560, 560));
     assert_eq!(scored.hit_rates, expected.hit_rates);
     assert_eq!(scored.top1, expected.top1);
 
@@ -310,7 +313,7 @@ async fn a_closed_loop_steers_every_motion_to_its_planned_goal() {
 
     let go = async |from: u32, displacement| {
         let closed_loop = |r: &mut pb::NavigateRequest| {
-            (r.source, r.displacement) = (frame(from), displacement);
+            (r.source, r.motion) = (frame(from), displacement);
             r.step_mode = pb::StepMode::ClosedLoop.into();
         };
         server.navigated(closed_loop).await.steps
@@ -334,7 +337,7 @@ async fn equal_questions_have_equal_answers() {
     let server = start(Config::default()).await;
 
     let still = |r: &mut pb::NavigateRequest| {
-        (r.displacement, r.steps) = (by_twist([0.0; 6]), Some(3));
+        (r.motion, r.steps) = (by_twist([0.0; 6]), Some(3));
     };
     for step in &server.navigated(still).await.steps {
         let nearest = &step.frames[0];
@@ -361,13 +364,13 @@ async fn equal_questions_have_equal_answers() {
     let pose = target.frames[0].frame.clone().unwrap().pose.unwrap();
     assert_eq!(pose.parent_frame, "rooms/synthetic");
 
-    let motion = one.displacement.unwrap();
+    let motion = one.motion.unwrap();
     for displacement in [
         to_pose(pose),
         by_twists(vec![motion]),
         by_twist(six(&motion)),
     ] {
-        let same = server.navigated(|r| r.displacement = displacement).await;
+        let same = server.navigated(|r| r.motion = displacement).await;
         let [same, one] = [&same, &one].map(end);
         let [found, expected] = [&same.frames[0], &one.frames[0]];
         assert_eq!(found.frame_id, expected.frame_id);
@@ -386,14 +389,14 @@ async fn a_feature_answers_as_its_frame_does_but_knows_no_truth() {
     let numbers = [0.1, 0.0, 0.3, 0.0, -0.2, 0.0];
     let from = async |source| {
         let go = |r: &mut pb::NavigateRequest| {
-            (r.source, r.displacement) = (source, by_twist(numbers));
+            (r.source, r.motion) = (source, by_twist(numbers));
             r.top_k = Some(3);
         };
         server.navigated(go).await
     };
     let frame_answer = from(frame(500)).await;
 
-    let still = server.navigated(|r| r.displacement = by_twist([0.0; 6]));
+    let still = server.navigated(|r| r.motion = by_twist([0.0; 6]));
     let latent_of = still.await.steps[0].latent.clone().unwrap().values;
 
     for source in [feature(feature_row(500)), latent(latent_of)] {
@@ -405,7 +408,7 @@ async fn a_feature_answers_as_its_frame_does_but_knows_no_truth() {
 
         assert_eq!(frames(&answer), frames(&frame_answer));
         assert!(answer.steps[0].error.is_none() && answer.steps[0].requested_pose.is_none());
-        assert!(answer.displacement.is_none());
+        assert!(answer.motion.is_none());
     }
 }
 
@@ -415,7 +418,7 @@ async fn exclusion_counts_and_lists_of_motions() {
     let server = start(Config::default()).await;
 
     let excluded = |r: &mut pb::NavigateRequest| {
-        (r.displacement, r.top_k) = (by_twist([0.0; 6]), Some(20));
+        (r.motion, r.top_k) = (by_twist([0.0; 6]), Some(20));
         (r.exclude_source, r.exclude_radius) = (true, 3);
     };
     let hits = server.navigated(excluded).await.steps[0].frames.clone();
@@ -427,7 +430,7 @@ async fn exclusion_counts_and_lists_of_motions() {
     let there = twist([0.2, 0.0, 0.1, 0.0, 0.3, 0.0]);
     let back = twist([-0.2, 0.0, -0.1, 0.0, -0.3, 0.0]);
     let list = |r: &mut pb::NavigateRequest| {
-        (r.displacement, r.steps) = (by_twists(vec![there, back]), Some(2));
+        (r.motion, r.steps) = (by_twists(vec![there, back]), Some(2));
     };
     let answer = server.navigated(list).await;
     assert_eq!(answer.steps.len(), 4);
@@ -444,7 +447,7 @@ async fn a_batch_answers_as_its_questions_do_and_one_failure_is_alone() {
     let server = start(Config::default()).await;
 
     let bad = pb::NavigateRequest {
-        room: "nope".to_owned(),
+        room: "nowhere".to_owned(),
         ..question()
     };
 
@@ -478,7 +481,9 @@ async fn a_batch_answers_as_its_questions_do_and_one_failure_is_alone() {
     let alone = server.client.navigate(bad).await.unwrap_err();
     assert_eq!(error.code, i32::from(tonic::Code::NotFound));
     let details = error.get_error_details();
-    assert_eq!(details.resource_info().unwrap().resource_type, "room");
+    let missing = details.resource_info().unwrap();
+    assert_eq!(missing.resource_type, "room");
+    assert_eq!(missing.resource_name, "nowhere");
     assert_eq!(
         details.error_info().map(|info| info.reason.clone()),
         alone.reason()
@@ -515,7 +520,7 @@ async fn the_catalog_lists_what_the_store_has() {
 
     assert_eq!(rooms[0].frame_count, 600);
     assert_eq!(rooms[0].adapters, ["oracle"]);
-    assert_eq!(rooms[0].features[0].dim, 48);
+    assert_eq!(rooms[0].feature_sources[0].dim, 48);
 
     let adapter = server.client.adapter("oracle").await.unwrap();
     assert_eq!((adapter.latent_dim, adapter.stride), (20, 40));
@@ -548,7 +553,7 @@ async fn the_hnsw_index_answers_as_the_exact_one_here_and_says_what_it_is() {
 
     for source in (0..560).step_by(40) {
         let go = |r: &mut pb::NavigateRequest| {
-            (r.source, r.displacement) = (frame(source), to_frame(source + 40));
+            (r.source, r.motion) = (frame(source), to_frame(source + 40));
             r.top_k = Some(10);
         };
         let a = exact.navigated(go).await;
@@ -575,17 +580,24 @@ async fn the_pairs_of_a_split_are_listed() {
     // The adapter was trained with the time split and a stride of 40.
     let pairs = list(pb::Split::Unspecified, None).await.unwrap();
     assert_eq!((pairs.split(), pairs.stride), (pb::Split::Time, 40));
-    assert_eq!(pairs.test_sources, (480..560).collect::<Vec<_>>());
-    assert_eq!(pairs.test_targets, (520..600).collect::<Vec<_>>());
-    assert_eq!(pairs.training_sources, (0..440).collect::<Vec<_>>());
-    assert_eq!(pairs.training_targets, (40..480).collect::<Vec<_>>());
-    assert_eq!(pairs.candidates, (480..600).collect::<Vec<_>>());
+    let pairs_at = |sources: std::ops::Range<u32>, stride: u32| -> Vec<pb::FramePair> {
+        let pairs = sources.map(|source| pb::FramePair {
+            source_frame_id: source,
+            target_frame_id: source + stride,
+        });
+        pairs.collect()
+    };
+    assert_eq!(pairs.test_pairs, pairs_at(480..560, 40));
+    assert_eq!(pairs.training_pairs, pairs_at(0..440, 40));
+    assert_eq!(pairs.candidate_frame_ids, (480..600).collect::<Vec<_>>());
 
     // Blocks 2, 7, … of 50 frames: 100 to 149, 350 to 399.
     let blocks = list(pb::Split::Blocks, Some(49)).await.unwrap();
-    assert_eq!(blocks.test_sources, [100, 350]);
-    assert_eq!(blocks.test_targets, [149, 399]);
-    assert!(blocks.candidates.contains(&100) && !blocks.candidates.contains(&150));
+    let expected = [pairs_at(100..101, 49), pairs_at(350..351, 49)].concat();
+    assert_eq!(blocks.test_pairs, expected);
+    assert!(
+        blocks.candidate_frame_ids.contains(&100) && !blocks.candidate_frame_ids.contains(&150)
+    );
 
     let error = list(pb::Split::Time, Some(120)).await.unwrap_err();
     assert_eq!(error.field().as_deref(), Some("stride"), "{error}");

@@ -73,7 +73,7 @@ impl Upload {
         Self {
             spec: pb::RoomUpload {
                 room: name.to_owned(),
-                features: vec![pb::FeatureSource {
+                feature_sources: vec![pb::FeatureSource {
                     name: source.name.clone(),
                     dim: source.dim as u32,
                     ..pb::FeatureSource::default()
@@ -175,12 +175,18 @@ async fn unfit_uploads_are_refused_and_leave_nothing() {
         (|u| u.spec.room = "rooms/bad".into(), "room.room"),
         (|u| u.spec.room = String::new(), "room.room"),
         (|u| u.spec.mode = 77, "room.mode"),
-        (|u| u.spec.features.clear(), "room.features"),
-        (|u| u.spec.features[0].dim = 0, "room.features.dim"),
-        (|u| u.spec.features[0].dim = u32::MAX, "room.features.dim"),
+        (|u| u.spec.feature_sources.clear(), "room.feature_sources"),
         (
-            |u| u.spec.features[0].name = "a/b".into(),
-            "room.features.name",
+            |u| u.spec.feature_sources[0].dim = 0,
+            "room.feature_sources.dim",
+        ),
+        (
+            |u| u.spec.feature_sources[0].dim = u32::MAX,
+            "room.feature_sources.dim",
+        ),
+        (
+            |u| u.spec.feature_sources[0].name = "a/b".into(),
+            "room.feature_sources.name",
         ),
         (|u| u.spec.encode_for = "oracle".into(), "room.encode_for"),
         (|u| u.spec.license = "x".repeat(2_000), "room.license"),
@@ -356,7 +362,7 @@ async fn defaults_are_set_and_cleared() {
             adapter: name.to_owned(),
         }))
     };
-    let room = || Some(Cleared::RoomAdapter("synthetic".to_owned()));
+    let room = || Some(Cleared::AdapterOfRoom("synthetic".to_owned()));
 
     let defaults = set(adapter("trial")).await.unwrap();
     let expected = pb::CatalogDefault {
@@ -393,7 +399,7 @@ async fn defaults_are_set_and_cleared() {
     };
     assert_eq!(left, [expected]);
     assert_eq!(answering().await, "trial");
-    let cleared = Some(Cleared::RoomRevision("synthetic".to_owned()));
+    let cleared = Some(Cleared::RevisionOfRoom("synthetic".to_owned()));
     assert_eq!(clear(cleared.clone()).await.unwrap(), []);
     assert_eq!(
         clear(cleared).await.unwrap(),
@@ -634,9 +640,9 @@ async fn a_room_is_fitted_on_the_server() {
     let cases: [(fn(&mut pb::FitAdapterRequest), _, _); 3] = [
         (|r| r.room = "nowhere".into(), Code::NotFound, "room"),
         (
-            |r| r.features = "none".into(),
+            |r| r.feature_set = "none".into(),
             Code::InvalidArgument,
-            "features",
+            "feature_set",
         ),
         (
             |r| r.base_adapter = "hall.made-up.fitted".into(),
@@ -719,7 +725,7 @@ async fn many_changes_at_once_are_made_or_refused() {
                 revision: 1,
             };
             if number % 2 == 0 {
-                let cleared = pb::clear_default_request::Default::RoomRevision(revision.name);
+                let cleared = pb::clear_default_request::Default::RevisionOfRoom(revision.name);
                 return code_of(
                     client
                         .clear_default(pb::ClearDefaultRequest {

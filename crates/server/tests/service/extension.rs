@@ -25,7 +25,7 @@ async fn server() -> TestServer {
 fn extension() -> pb::RoomUpload {
     pb::RoomUpload {
         room: "hall".to_owned(),
-        features: vec![pb::FeatureSource {
+        feature_sources: vec![pb::FeatureSource {
             name: "made-up".to_owned(),
             dim: served("hall").1.source().dim as u32,
             ..pb::FeatureSource::default()
@@ -179,9 +179,9 @@ async fn unfit_extensions_are_refused_and_leave_the_room() {
         ),
         (
             pb::RoomUpload {
-                features: vec![pb::FeatureSource {
+                feature_sources: vec![pb::FeatureSource {
                     name: "other".to_owned(),
-                    ..upload().features[0].clone()
+                    ..upload().feature_sources[0].clone()
                 }],
                 ..upload()
             },

@@ -206,7 +206,7 @@ async fn a_route_keeps_to_its_bounds() {
     );
 
     let request = || question(frame(1), Goal::GoalFrameId(2));
-    let cases: [Unfit<pb::PlanRouteRequest>; 7] = [
+    let cases: [Unfit<pb::PlanRouteRequest>; 9] = [
         (|r| r.goal = None, "goal"),
         (|r| r.source = None, "source"),
         (
@@ -217,6 +217,14 @@ async fn a_route_keeps_to_its_bounds() {
         (|r| r.tolerance_m = Some(0.0), "tolerance_m"),
         (|r| r.max_hops = Some(0), "max_hops"),
         (|r| r.max_hops = Some(u32::MAX), "max_hops"),
+        (|r| r.max_recoveries = Some(1), "max_recoveries"),
+        (
+            |r| {
+                r.min_arrival_probability = Some(0.5);
+                r.set_planner(pb::Planner::Latent);
+            },
+            "min_arrival_probability",
+        ),
     ];
     for (spoil, field) in cases {
         let mut spoiled = request();

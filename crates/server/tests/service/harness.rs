@@ -5,7 +5,7 @@ use std::sync::mpsc;
 use std::time::Duration;
 
 use ndarray::Array2;
-use pb::displacement::Displacement;
+use pb::requested_motion::Motion;
 use seese3_client::proto::v1 as pb;
 use seese3_client::{Client, Error};
 use seese3_core::adapter::{
@@ -276,7 +276,7 @@ pub fn frame(frame: u32) -> Option<pb::View> {
 pub fn feature(values: Vec<f32>) -> Option<pb::View> {
     let feature = pb::Feature {
         values,
-        source_name: String::new(),
+        feature_set: String::new(),
     };
     Some(pb::View {
         view: Some(pb::view::View::Feature(feature)),
@@ -306,22 +306,27 @@ pub fn feature_row(row: usize) -> Vec<f32> {
     features_of("synthetic").rows().row(row).to_vec()
 }
 
-pub fn displaced(by: Displacement) -> Option<pb::Displacement> {
-    Some(pb::Displacement {
-        displacement: Some(by),
+/// A camera of these intrinsics.
+pub fn of_intrinsics(intrinsics: pb::CameraIntrinsics) -> Option<pb::ViewCamera> {
+    Some(pb::ViewCamera {
+        camera: Some(pb::view_camera::Camera::Intrinsics(intrinsics)),
     })
 }
 
-pub fn by_twist(numbers: [f64; 6]) -> Option<pb::Displacement> {
-    displaced(Displacement::Twist(twist(numbers)))
+pub fn displaced(by: Motion) -> Option<pb::RequestedMotion> {
+    Some(pb::RequestedMotion { motion: Some(by) })
 }
 
-pub fn by_twists(twists: Vec<pb::Twist>) -> Option<pb::Displacement> {
-    displaced(Displacement::Twists(pb::TwistList { twists }))
+pub fn by_twist(numbers: [f64; 6]) -> Option<pb::RequestedMotion> {
+    displaced(Motion::Twist(twist(numbers)))
 }
 
-pub fn to_pose(pose: pb::Pose) -> Option<pb::Displacement> {
-    displaced(Displacement::TargetPose(pose))
+pub fn by_twists(twists: Vec<pb::Twist>) -> Option<pb::RequestedMotion> {
+    displaced(Motion::Twists(pb::TwistList { twists }))
+}
+
+pub fn to_pose(pose: pb::Pose) -> Option<pb::RequestedMotion> {
+    displaced(Motion::TargetPose(pose))
 }
 
 pub fn twist([vx, vy, vz, wx, wy, wz]: [f64; 6]) -> pb::Twist {
@@ -332,8 +337,8 @@ pub fn twist([vx, vy, vz, wx, wy, wz]: [f64; 6]) -> pb::Twist {
     }
 }
 
-pub fn to_frame(frame: u32) -> Option<pb::Displacement> {
-    displaced(Displacement::TargetFrameId(frame))
+pub fn to_frame(frame: u32) -> Option<pb::RequestedMotion> {
+    displaced(Motion::TargetFrameId(frame))
 }
 
 /// From frame 500 to frame 540, one step.
@@ -341,7 +346,7 @@ pub fn question() -> pb::NavigateRequest {
     pb::NavigateRequest {
         room: "synthetic".to_owned(),
         source: frame(500),
-        displacement: to_frame(540),
+        motion: to_frame(540),
         ..pb::NavigateRequest::default()
     }
 }

@@ -122,10 +122,10 @@ fn navigate(source: Option<pb::View>) -> pb::NavigateRequest {
     pb::NavigateRequest {
         room: ROOM.to_owned(),
         source,
-        displacement: Some(pb::Displacement {
-            displacement: Some(pb::displacement::Displacement::Twist(
-                crate::harness::twist([0.1, 0.0, 0.05, 0.0, 0.1, 0.0]),
-            )),
+        motion: Some(pb::RequestedMotion {
+            motion: Some(pb::requested_motion::Motion::Twist(crate::harness::twist(
+                [0.1, 0.0, 0.05, 0.0, 0.1, 0.0],
+            ))),
         }),
         ..pb::NavigateRequest::default()
     }
@@ -268,7 +268,7 @@ async fn images_that_cannot_be_answered_are_refused_by_field() {
         );
 
         let by_frame = pb::NavigateRequest {
-            displacement: to_frame(20),
+            motion: to_frame(20),
             ..navigate(frame(10))
         };
 

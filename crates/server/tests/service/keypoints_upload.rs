@@ -39,12 +39,12 @@ fn parts(file: &[u8]) -> Vec<Vec<u8>> {
 }
 
 /// An upload of the room with its keypoints.
-fn upload(name: &str) -> Upload {
+pub fn upload(name: &str) -> Upload {
     let room = room_of("any", "synthetic");
     let mut upload = Upload::of(name, &room, &features_of("synthetic"));
     upload.spec.camera = Some(camera_to_wire(&distorted_camera()));
     upload.spec.keypoints = Some(pb::KeypointsUpload {
-        features: "oracle".to_owned(),
+        feature_set: "oracle".to_owned(),
         positions: "kpt".to_owned(),
         reliability: "heat".to_owned(),
         descriptors: "fusion".to_owned(),
@@ -183,10 +183,13 @@ async fn unfit_keypoints_are_refused_and_leave_nothing() {
     let cases: [Unfit<Upload>; 21] = [
         (|u| u.spec.camera = None, "room.camera"),
         (
-            |u| stated(u).features = "other".into(),
-            "room.keypoints.features",
+            |u| stated(u).feature_set = "other".into(),
+            "room.keypoints.feature_set",
         ),
-        (|u| stated(u).features.clear(), "room.keypoints.features"),
+        (
+            |u| stated(u).feature_set.clear(),
+            "room.keypoints.feature_set",
+        ),
         (|u| stated(u).positions.clear(), "room.keypoints.positions"),
         (
             |u| stated(u).reliability.clear(),

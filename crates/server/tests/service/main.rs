@@ -9,6 +9,7 @@
 
 mod answers;
 mod changes;
+mod downloads;
 mod extension;
 mod fitted;
 mod frames;

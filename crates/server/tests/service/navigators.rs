@@ -69,7 +69,7 @@ async fn start_with(adapter: &Adapter) -> TestServer {
 async fn imagined(server: &TestServer, navigator: &str, source: u32) -> pb::NavigateResponse {
     let request = pb::NavigateRequest {
         source: frame(source),
-        displacement: to_frame(source + 40),
+        motion: to_frame(source + 40),
         navigator: navigator.to_owned(),
         ..question()
     };

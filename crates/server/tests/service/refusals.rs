@@ -1,15 +1,15 @@
 //! Bad visitors: each gets the right code and the field to change, and the server goes on.
 
-use pb::displacement::Displacement;
 use pb::prediction::Prediction as Scored;
+use pb::requested_motion::Motion;
 use seese3_client::Error;
 use seese3_client::proto::v1 as pb;
 use seese3_server::Config;
 use tonic::Code::{self, InvalidArgument, NotFound};
 
 use crate::harness::{
-    TestServer, by_twist, by_twists, displaced, feature, feature_row, frame, latent, question,
-    refused, start, to_frame, to_pose, twist,
+    TestServer, by_twist, by_twists, displaced, feature, feature_row, frame, latent, of_intrinsics,
+    question, refused, start, to_frame, to_pose, twist,
 };
 
 /// What is bad about a request, how a good one becomes so, and the field that the answer names.
@@ -49,10 +49,10 @@ fn level() -> pb::Pose {
     }
 }
 
-fn named(source_name: &str) -> Option<pb::View> {
+fn named(feature_set: &str) -> Option<pb::View> {
     let feature = pb::Feature {
         values: feature_row(3),
-        source_name: source_name.to_owned(),
+        feature_set: feature_set.to_owned(),
     };
     Some(pb::View {
         view: Some(pb::view::View::Feature(feature)),
@@ -65,7 +65,7 @@ async fn navigate_names_the_field() {
     // A request by a view, of which the frame is not known.
     fn by_view(request: &mut pb::NavigateRequest, source: Option<pb::View>) {
         request.source = source;
-        request.displacement = by_twist([0.0; 6]);
+        request.motion = by_twist([0.0; 6]);
     }
 
     let invalid: [Case<pb::NavigateRequest>; 27] = [
@@ -93,7 +93,7 @@ async fn navigate_names_the_field() {
         (
             "other encoder",
             |r| by_view(r, named("clip")),
-            "source.feature.source_name",
+            "source.feature.feature_set",
         ),
         (
             "infinite latent",
@@ -105,7 +105,7 @@ async fn navigate_names_the_field() {
             |r| by_view(r, latent(vec![0.0; 21])),
             "source.latent.values",
         ),
-        ("no displacement", |r| r.displacement = None, "displacement"),
+        ("no motion", |r| r.motion = None, "motion"),
         (
             "half a twist",
             |r| {
@@ -113,49 +113,45 @@ async fn navigate_names_the_field() {
                     angular: None,
                     ..twist([0.0; 6])
                 };
-                r.displacement = displaced(Displacement::Twist(half));
+                r.motion = displaced(Motion::Twist(half));
             },
-            "displacement.twist.angular",
+            "motion.twist.angular",
         ),
         (
             "NaN twist",
-            |r| r.displacement = by_twist([f64::NAN, 0.0, 0.0, 0.0, 0.0, 0.0]),
-            "displacement.twist.linear",
+            |r| r.motion = by_twist([f64::NAN, 0.0, 0.0, 0.0, 0.0, 0.0]),
+            "motion.twist.linear",
         ),
         (
             "beyond π",
-            |r| r.displacement = by_twist([0.0, 0.0, 0.0, 0.0, 3.2, 0.0]),
-            "displacement",
+            |r| r.motion = by_twist([0.0, 0.0, 0.0, 0.0, 3.2, 0.0]),
+            "motion",
         ),
         (
             "far away",
-            |r| r.displacement = by_twist([1e300, 0.0, 0.0, 0.0, 0.0, 0.0]),
-            "displacement",
+            |r| r.motion = by_twist([1e300, 0.0, 0.0, 0.0, 0.0, 0.0]),
+            "motion",
         ),
-        (
-            "no twists",
-            |r| r.displacement = by_twists(vec![]),
-            "displacement",
-        ),
+        ("no twists", |r| r.motion = by_twists(vec![]), "motion"),
         (
             "another world",
             |r| {
-                r.displacement = to_pose(pb::Pose {
+                r.motion = to_pose(pb::Pose {
                     parent_frame: "odom".into(),
                     ..level()
                 })
             },
-            "displacement.target_pose.parent_frame",
+            "motion.target_pose.parent_frame",
         ),
         (
             "no rotation",
             |r| {
-                r.displacement = to_pose(pb::Pose {
+                r.motion = to_pose(pb::Pose {
                     orientation: turned(2.0),
                     ..level()
                 })
             },
-            "displacement.target_pose.orientation",
+            "motion.target_pose.orientation",
         ),
         ("0 steps", |r| r.steps = Some(0), "steps"),
         ("10⁶ steps", |r| r.steps = Some(1_000_000), "steps"),
@@ -199,8 +195,8 @@ async fn navigate_names_the_field() {
         ),
         (
             "unknown target",
-            |r| r.displacement = to_frame(9999),
-            "displacement.target_frame_id",
+            |r| r.motion = to_frame(9999),
+            "motion.target_frame_id",
         ),
     ];
 
@@ -280,21 +276,21 @@ async fn estimate_motion_names_the_field() {
             |r| {
                 r.first = feature(feature_row(1));
                 r.second = feature(feature_row(2));
-                r.camera = Some(pb::CameraIntrinsics {
+                r.camera = of_intrinsics(pb::CameraIntrinsics {
                     width: 640.0,
                     height: 480.0,
                     fx: 0.914,
                     ..pb::CameraIntrinsics::default()
                 });
             },
-            "camera",
+            "camera.intrinsics",
         ),
         (
             "coefficients without a model",
             |r| {
                 r.first = feature(feature_row(1));
                 r.second = feature(feature_row(2));
-                r.camera = Some(pb::CameraIntrinsics {
+                r.camera = of_intrinsics(pb::CameraIntrinsics {
                     width: 640.0,
                     height: 480.0,
                     fx: 525.0,
@@ -302,7 +298,7 @@ async fn estimate_motion_names_the_field() {
                     ..pb::CameraIntrinsics::default()
                 });
             },
-            "camera.distortion_model",
+            "camera.intrinsics.distortion_model",
         ),
         (
             "narrow second",
@@ -475,7 +471,7 @@ async fn batches_and_the_catalog_name_the_field() {
                 let list = by_twists(vec![twist([0.0; 6]); 1_000]);
                 batch
                     .iter_mut()
-                    .for_each(|r| (r.displacement, r.top_k) = (list.clone(), Some(6)));
+                    .for_each(|r| (r.motion, r.top_k) = (list.clone(), Some(6)));
             },
             "requests",
         ),

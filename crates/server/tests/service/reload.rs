@@ -128,7 +128,7 @@ async fn what_is_damaged_is_refused_by_itself() {
     let in_new = pb::NavigateRequest {
         room: "new".to_owned(),
         source: frame(10),
-        displacement: to_frame(20),
+        motion: to_frame(20),
         ..question()
     };
     let refused = async || code_of(client.navigate(in_new.clone()).await);

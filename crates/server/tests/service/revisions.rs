@@ -13,7 +13,7 @@ use crate::harness::{
 use seese3_core::features::Features;
 
 /// The first frames of the room `synthetic`.
-fn shorter(frame_count: usize) -> (Room, Features) {
+pub fn shorter(frame_count: usize) -> (Room, Features) {
     let whole = room_of("synthetic", "synthetic");
     let frames = Frames {
         poses: whole.poses()[..frame_count].to_vec(),
@@ -97,7 +97,7 @@ async fn a_stated_revision_is_answered_as_before() {
     .await;
 
     let now = client.evaluate(evaluate(None), |_| ()).await.unwrap();
-    assert_ne!(now.n, evaluated.n);
+    assert_ne!(now.pair_count, evaluated.pair_count);
     assert_eq!(
         client.evaluate(evaluate(Some(1)), |_| ()).await.unwrap(),
         evaluated

@@ -34,7 +34,7 @@ fn in_room(room: &str) -> pb::NavigateRequest {
     pb::NavigateRequest {
         room: room.to_owned(),
         source: frame(10),
-        displacement: crate::harness::to_frame(50),
+        motion: crate::harness::to_frame(50),
         ..question()
     }
 }

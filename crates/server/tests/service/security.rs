@@ -21,8 +21,8 @@ use crate::harness::{
 use crate::http2::opened;
 use crate::isolation;
 
-const VERBS: [&str; 6] = [
-    "navigate", "localize", "track", "evaluate", "catalog", "write",
+const VERBS: [&str; 7] = [
+    "navigate", "localize", "track", "evaluate", "catalog", "write", "download",
 ];
 
 fn hex_digest(bytes: &[u8]) -> String {
@@ -74,12 +74,12 @@ pub async fn client_with(server: &TestServer, token: Option<&str>) -> Client {
 }
 
 /// Asks one RPC of each verb, in their order.
-async fn asked(client: &Client) -> [Code; 6] {
+async fn asked(client: &Client) -> [Code; 7] {
     asked_in(client, "synthetic").await
 }
 
 /// Asks one RPC of each verb about a room.
-async fn asked_in(client: &Client, room: &str) -> [Code; 6] {
+async fn asked_in(client: &Client, room: &str) -> [Code; 7] {
     let localized = client.localize(pb::LocalizeRequest {
         rooms: vec![room.to_owned()],
         view: frame(3),
@@ -103,15 +103,21 @@ async fn asked_in(client: &Client, room: &str) -> [Code; 6] {
     let navigated = pb::NavigateRequest {
         room: room.to_owned(),
         source: frame(3),
-        displacement: to_frame(5),
+        motion: to_frame(5),
         ..pb::NavigateRequest::default()
     };
     let nothing_chosen = client.clear_default(pb::ClearDefaultRequest {
-        default: Some(pb::clear_default_request::Default::RoomRevision(
+        default: Some(pb::clear_default_request::Default::RevisionOfRoom(
             room.to_owned(),
         )),
         ..pb::ClearDefaultRequest::default()
     });
+
+    let downloaded = pb::DownloadRoomRequest {
+        room: room.to_owned(),
+        ..pb::DownloadRoomRequest::default()
+    };
+    let received = |_| Ok::<_, seese3_client::Error>(());
 
     [
         code_of(client.navigate(navigated).await),
@@ -120,6 +126,7 @@ async fn asked_in(client: &Client, room: &str) -> [Code; 6] {
         code_of(evaluated.await),
         code_of(client.room(room).await),
         code_of(nothing_chosen.await),
+        code_of(client.download_room(downloaded, received).await),
     ]
 }
 
@@ -142,13 +149,13 @@ async fn a_caller_may_what_its_verbs_say_and_nothing_else() {
     }
 
     let everything = client_with(&server, Some("everything")).await;
-    assert_eq!(asked(&everything).await, [Code::Ok; 6]);
+    assert_eq!(asked(&everything).await, [Code::Ok; 7]);
 
     for token in [None, Some("nobody"), Some("Everything")] {
         let client = client_with(&server, token).await;
         assert_eq!(
             asked(&client).await,
-            [Code::Unauthenticated; 6],
+            [Code::Unauthenticated; 7],
             "{token:?}"
         );
         assert!(client.serves("").await.unwrap(), "health needs no token");
@@ -228,13 +235,14 @@ async fn tokens_that_an_issuer_signed_are_taken() {
     let codes =
         async |token: &serde_json::Value| asked(&client_with(&server, token.as_str()).await).await;
 
-    assert_eq!(codes(&tokens["good"]["ES256"]).await, [Code::Ok; 6]);
+    assert_eq!(codes(&tokens["good"]["ES256"]).await, [Code::Ok; 7]);
     let denied = Code::PermissionDenied;
     let scoped = codes(&tokens["narrowed"]["scope"]).await;
-    assert_eq!(scoped, [Code::Ok, denied, denied, denied, denied, Code::Ok]);
+    let expected = [Code::Ok, denied, denied, denied, denied, Code::Ok, denied];
+    assert_eq!(scoped, expected);
     for what in ["expired", "of another key", "of no algorithm"] {
         let codes = codes(&tokens["bad"][what][0]).await;
-        assert_eq!(codes, [Code::Unauthenticated; 6], "{what}");
+        assert_eq!(codes, [Code::Unauthenticated; 7], "{what}");
     }
 }
 
@@ -244,7 +252,7 @@ async fn tokens_that_an_issuer_signed_are_taken() {
 async fn a_room_out_of_reach_does_not_exist() {
     let server = start_with_credentials().await;
     let client = client_with(&server, Some("one-room")).await;
-    assert_eq!(asked(&client).await, [Code::Ok; 6]);
+    assert_eq!(asked(&client).await, [Code::Ok; 7]);
 
     let names: Vec<String> = client
         .rooms()
@@ -259,7 +267,7 @@ async fn a_room_out_of_reach_does_not_exist() {
         let request = pb::NavigateRequest {
             room: room.to_owned(),
             source: frame(10),
-            displacement: to_frame(20),
+            motion: to_frame(20),
             ..pb::NavigateRequest::default()
         };
         client.navigate(request).await.unwrap_err().to_string()
@@ -452,7 +460,7 @@ async fn connections_without_credentials_make_room() {
     let question = || pb::NavigateRequest {
         room: "lab".to_owned(),
         source: frame(3),
-        displacement: to_frame(5),
+        motion: to_frame(5),
         ..pb::NavigateRequest::default()
     };
 

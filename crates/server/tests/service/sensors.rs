@@ -86,7 +86,7 @@ async fn gravity_that_contradicts_the_views_is_said() {
                 let down = room.poses()[row].rotation.inverse() * DOWN;
                 frame.gravity = Some(pb::MeasuredGravity {
                     direction: Some(wire(on * down)),
-                    frame: name.to_owned(),
+                    coordinate_frame: name.to_owned(),
                     deviation_rad: None,
                 });
             })
@@ -110,7 +110,7 @@ fn second_camera(mounting: &Pose) -> pb::RigCamera {
     pb::RigCamera {
         name: "second".to_owned(),
         pose: Some(convert::pose_to_wire(mounting, "camera", "second")),
-        camera: None,
+        intrinsics: None,
         time_offset_ns: 0,
     }
 }
@@ -121,7 +121,7 @@ fn covered(row: usize) -> pb::TrackRequest {
     changed(row, |frame| {
         frame.view = row_of("attic", 0);
         frame.other_views = vec![pb::OtherView {
-            camera: "second".to_owned(),
+            camera_name: "second".to_owned(),
             view: row_of("hall", row),
         }];
     })
@@ -142,7 +142,7 @@ async fn a_second_camera_finds_a_robot_whose_own_is_covered() {
     let found = updates(&server, rig.clone(), (0..80).map(covered)).await;
     let last = &found[79];
     assert_eq!(last.status(), pb::TrackStatus::Tracking, "{}", last.reason);
-    assert_eq!(last.r#match.as_ref().unwrap().camera, "second");
+    assert_eq!(last.r#match.as_ref().unwrap().camera_name, "second");
     let truth = room.poses()[79] * mounting.inverse();
     let off = PoseError::between(&pose(last.map_from_camera()), &truth);
     assert!(off.translation_m < 0.1, "{off:?}");
@@ -151,7 +151,7 @@ async fn a_second_camera_finds_a_robot_whose_own_is_covered() {
     let alone = (0..80).map(|row| changed(row, |frame| frame.view = row_of("attic", 0)));
     let alone = updates(&server, rig, alone).await;
     assert_ne!(alone[79].status(), pb::TrackStatus::Tracking);
-    assert_eq!(alone[79].r#match.as_ref().unwrap().camera, "");
+    assert_eq!(alone[79].r#match.as_ref().unwrap().camera_name, "");
 }
 
 /// Oracle: the stream that is never covered. A hand before the lens of a robot whose other camera
@@ -167,7 +167,7 @@ async fn a_hand_before_one_of_two_lenses_loses_nothing() {
     let frames = (0..140).map(|row| {
         changed(row, |frame| {
             frame.other_views = vec![pb::OtherView {
-                camera: "second".to_owned(),
+                camera_name: "second".to_owned(),
                 view: row_of("hall", row),
             }];
             if (60..100).contains(&row) {
@@ -187,7 +187,7 @@ async fn a_hand_before_one_of_two_lenses_loses_nothing() {
         let off = PoseError::between(&pose(update.map_from_camera()), &room.poses()[row]);
         assert!(off.translation_m < 0.1, "{row}: {off:?}");
     }
-    assert_eq!(found[80].r#match.as_ref().unwrap().camera, "second");
+    assert_eq!(found[80].r#match.as_ref().unwrap().camera_name, "second");
 }
 
 /// Oracle: a frozen second camera tells nothing: it leads no more, and the stream's own camera is
@@ -214,14 +214,15 @@ async fn a_frozen_second_camera_is_not_believed() {
         changed(row, |frame| {
             frame.view = own(row);
             frame.other_views = vec![pb::OtherView {
-                camera: "second".to_owned(),
+                camera_name: "second".to_owned(),
                 view: row_of("hall", 5),
             }];
         })
     });
 
     let found = updates(&server, rig, frozen).await;
-    let leads = |update: &&pb::TrackUpdate| update.r#match.as_ref().unwrap().camera == "second";
+    let leads =
+        |update: &&pb::TrackUpdate| update.r#match.as_ref().unwrap().camera_name == "second";
     assert!(leads(&&found[0]));
     assert!(!found[1..].iter().any(|update| leads(&update)));
     let last = &found[79];
@@ -248,7 +249,7 @@ async fn a_stream_with_a_rig_and_gravity_resumes() {
                     ..Default::default()
                 });
                 frame.other_views = vec![pb::OtherView {
-                    camera: "second".to_owned(),
+                    camera_name: "second".to_owned(),
                     view: row_of("hall", row.min(10)),
                 }];
             })
@@ -289,7 +290,7 @@ async fn measurements_that_are_none_are_refused() {
     let others = |names: &'static [&'static str], view: Option<pb::View>| {
         changed(1, move |frame| {
             let other = |name: &&str| pb::OtherView {
-                camera: (*name).to_owned(),
+                camera_name: (*name).to_owned(),
                 view: view.clone(),
             };
             frame.other_views = names.iter().map(other).collect();
@@ -318,7 +319,7 @@ async fn measurements_that_are_none_are_refused() {
         ),
         (
             gravity(pb::MeasuredGravity {
-                frame: "base_link".to_owned(),
+                coordinate_frame: "base_link".to_owned(),
                 ..down.clone()
             }),
             Reason::Gravity,
@@ -340,7 +341,7 @@ async fn measurements_that_are_none_are_refused() {
         (
             others(&["second", "second"], row_of("hall", 1)),
             Reason::View,
-            "other_views[1].camera",
+            "other_views[1].camera_name",
         ),
         (
             others(&["second"], feature(vec![0.0; 47])),
@@ -603,7 +604,7 @@ async fn rigs_that_are_none_are_refused() {
     let named = |name: &str| pb::RigCamera {
         name: name.to_owned(),
         pose: Some(convert::pose_to_wire(&Pose::identity(), "", "")),
-        camera: None,
+        intrinsics: None,
         time_offset_ns: 0,
     };
     let cases = [
@@ -621,10 +622,10 @@ async fn rigs_that_are_none_are_refused() {
         ),
         (
             vec![pb::RigCamera {
-                camera: Some(pb::CameraIntrinsics::default()),
+                intrinsics: Some(pb::CameraIntrinsics::default()),
                 ..named("a")
             }],
-            "config.other_cameras[0].camera",
+            "config.other_cameras[0].intrinsics",
         ),
         (
             (0..9).map(|number| named(&format!("c{number}"))).collect(),

@@ -12,7 +12,7 @@ use seese3_server::{Config, TokenKey};
 use seese3_store::Store;
 use tonic::Code;
 
-use crate::harness::{TestServer, Unfit, feature, frame, start_on};
+use crate::harness::{TestServer, Unfit, feature, frame, of_intrinsics, start_on};
 use seese3_testing::world::{FRAMES, calibrated, place, served};
 
 /// Two places, and an adapter that can be followed with; `key` seals tokens.
@@ -451,7 +451,7 @@ async fn a_stream_is_configured_once_and_first() {
     let server = server(KEY).await;
     let with_camera = |focal: f64| {
         begin(pb::TrackConfig {
-            camera: Some(pb::CameraIntrinsics {
+            camera: of_intrinsics(pb::CameraIntrinsics {
                 width: 1280.0,
                 height: 960.0,
                 fx: focal,
@@ -488,10 +488,13 @@ async fn a_stream_is_configured_once_and_first() {
         refuses(requests, word).await;
     }
 
-    fn keyframes(displacement: Option<f64>, frames: Option<u32>) -> Option<pb::KeyframePolicy> {
+    fn keyframes(
+        motion_norm: Option<f64>,
+        sequence_interval: Option<u32>,
+    ) -> Option<pb::KeyframePolicy> {
         Some(pb::KeyframePolicy {
-            displacement,
-            frames,
+            motion_norm,
+            sequence_interval,
         })
     }
     let cases: [Unfit<pb::TrackConfig>; 8] = [
@@ -501,11 +504,11 @@ async fn a_stream_is_configured_once_and_first() {
         (|c| c.back_pressure = 9, "config.back_pressure"),
         (
             |c| c.keyframes = keyframes(Some(f64::NAN), None),
-            "config.keyframes.displacement",
+            "config.keyframes.motion_norm",
         ),
         (
             |c| c.keyframes = keyframes(None, Some(0)),
-            "config.keyframes.frames",
+            "config.keyframes.sequence_interval",
         ),
         (
             |c| c.initial_pose = Some(pb::InitialPose::default()),
@@ -513,13 +516,13 @@ async fn a_stream_is_configured_once_and_first() {
         ),
         (
             |c| {
-                c.frames = Some(pb::FrameNames {
+                c.frame_names = Some(pb::FrameNames {
                     map: "x".to_owned(),
                     odom: "x".to_owned(),
                     ..pb::FrameNames::default()
                 });
             },
-            "config.frames",
+            "config.frame_names",
         ),
     ];
     for (spoil, word) in cases {
@@ -566,7 +569,7 @@ async fn rooms_that_cannot_be_tracked_in_do_not_stop_a_search() {
     let server = start_on(folder, store, Config::default()).await;
 
     let anywhere = pb::TrackConfig {
-        camera: Some(pb::CameraIntrinsics {
+        camera: of_intrinsics(pb::CameraIntrinsics {
             width: 640.0,
             height: 480.0,
             fx: 585.0,

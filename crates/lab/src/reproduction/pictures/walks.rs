@@ -9,7 +9,7 @@ use seese3_core::adapter::{Adapter, Reading};
 use seese3_core::cancel::Cancellation;
 use seese3_core::geometry::{PoseError, Twist, body_twist, exp};
 use seese3_core::navigation::{
-    Displacement, FitOn, IndexKind, Limits, Mode, Navigator, Query, RetrievalMetric, Source,
+    FitOn, IndexKind, Limits, Mode, Navigator, Query, RequestedMotion, RetrievalMetric, Source,
     SourceAt, StepKind,
 };
 use seese3_core::room::FrameId;
@@ -135,7 +135,7 @@ fn walked(navigator: &Navigator, pair: Pair) -> Result<Vec<u32>, Error> {
             source: Source::Frame(pair.source),
             pose: None,
         },
-        displacement: Displacement::TargetFrame(pair.target),
+        motion: RequestedMotion::TargetFrame(pair.target),
         steps: STEPS,
         mode: Mode::OpenLoop,
         step: StepKind::InversePoincare(Reading::Homogeneous),

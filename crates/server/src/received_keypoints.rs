@@ -1,7 +1,6 @@
-//! The keypoints of an uploaded room.
+//! The keypoints of a room as they arrive in messages.
 
-use super::super::{Error, convert};
-use super::changes::check_length;
+use super::{Error, convert};
 use seese3_client::proto::v1 as pb;
 use seese3_core::features::FeatureSource;
 use seese3_core::keypoints::KeypointSource;
@@ -13,6 +12,7 @@ use seese3_store::{KeypointsHeader, RoomKeypoints};
 const MEMORY_FACTOR: usize = 4;
 
 /// The keypoints of an upload in progress.
+#[derive(Debug)]
 pub struct ReceivedKeypoints {
     header: KeypointsHeader,
     file: Vec<u8>,
@@ -24,7 +24,7 @@ impl ReceivedKeypoints {
     ///
     /// # Errors
     /// [`Error::Invalid`] with a field of the first message.
-    pub fn begun(
+    pub fn begin(
         upload: &pb::RoomUpload,
         sources: &[FeatureSource],
     ) -> Result<Option<Self>, Error> {
@@ -94,22 +94,24 @@ fn source(
     stated: &pb::KeypointsUpload,
     sources: &[FeatureSource],
 ) -> Result<KeypointSource, Error> {
-    let feature = sources.iter().find(|source| source.name == stated.features);
+    let feature = sources
+        .iter()
+        .find(|source| source.name == stated.feature_set);
     let feature = feature.ok_or_else(|| {
         let names: Vec<&str> = sources.iter().map(|source| source.name.as_str()).collect();
         let problem = format!(
-            "'{}' is none of the features of the upload: {}",
-            stated.features,
+            "'{}' is none of the feature sets of the upload: {}",
+            stated.feature_set,
             names.join(", ")
         );
-        Error::invalid("features", problem)
+        Error::invalid("feature_set", problem)
     })?;
 
     let output = |field: &str, name: &String| {
         if name.is_empty() {
             return Err(Error::invalid(field, "is required"));
         }
-        check_length(field, name)?;
+        convert::check_length(field, name)?;
         Ok(name.clone())
     };
     Ok(KeypointSource {

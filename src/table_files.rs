@@ -1,0 +1,71 @@
+//! The options `--table` and `--plot`, of commands that print a table.
+
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+
+use super::output::{check_writable, say, write_file};
+use seese3_lab::report::{Table, dot_plot};
+
+#[derive(Debug, Args)]
+pub struct TableFiles {
+    /// Also write the table to this file: .csv for programs, .tex for LaTeX with booktabs, .md for
+    /// Markdown
+    #[arg(long, value_name = "FILE", value_parser = table_file)]
+    table: Option<PathBuf>,
+    /// Also draw the table to this SVG file: a panel for each column of numbers
+    #[arg(long, value_name = "FILE.svg", value_parser = plot_file)]
+    plot: Option<PathBuf>,
+}
+
+impl TableFiles {
+    /// Checks, before the work, that the files can be written.
+    pub fn begin(&self) -> anyhow::Result<()> {
+        let files = self.table.iter().chain(&self.plot);
+        files.map(PathBuf::as_path).try_for_each(check_writable)
+    }
+
+    /// Prints the table, and writes the files that were asked for. `title` is that of the plot.
+    pub fn say(&self, table: &Table, title: &str) -> anyhow::Result<()> {
+        say(table);
+        if let Some(file) = &self.table {
+            write_file(file, table_text(file, table).as_bytes())?;
+            say(format_args!("wrote {}", file.display()));
+        }
+        if let Some(file) = &self.plot {
+            write_file(file, &dot_plot(table, title)?)?;
+            say(format_args!("wrote {}", file.display()));
+        }
+        Ok(())
+    }
+}
+
+/// The table in the format of the file's extension.
+fn table_text(file: &Path, table: &Table) -> String {
+    match file.extension().and_then(OsStr::to_str) {
+        Some("tex") => table.escaped_for_latex().latex(),
+        Some("md") => table.markdown(),
+        _ => table.csv(),
+    }
+}
+
+/// Accepts a file name that ends with .svg.
+pub fn plot_file(given: &str) -> Result<PathBuf, String> {
+    named(given, &["svg"])
+}
+
+/// Accepts a file name that ends with .csv, .tex or .md.
+pub fn table_file(given: &str) -> Result<PathBuf, String> {
+    named(given, &["csv", "tex", "md"])
+}
+
+fn named(given: &str, extensions: &[&str]) -> Result<PathBuf, String> {
+    let path = PathBuf::from(given);
+    let extension = path.extension().and_then(OsStr::to_str).unwrap_or_default();
+    if extensions.contains(&extension) {
+        return Ok(path);
+    }
+    let known: Vec<String> = extensions.iter().map(|known| format!(".{known}")).collect();
+    Err(format!("the name must end with {}", known.join(" or ")))
+}
