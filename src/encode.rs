@@ -46,7 +46,7 @@ pub struct Encode {
     images: Option<PathBuf>,
     /// Prefix of the feature names, PREFIX-LAYER-POOLING; the model's file name without extension
     /// if omitted
-    #[arg(long = "as", value_name = "PREFIX")]
+    #[arg(long = "prefix", value_name = "PREFIX")]
     prefix: Option<String>,
     /// Drop frames with an unreadable image, instead of stopping. The room's new revision omits
     /// these frames, in all its features
@@ -399,13 +399,13 @@ pub fn check_names(sources: &[FeatureSource]) -> anyhow::Result<()> {
         if !is_plain_name(name) {
             bail!(
                 "layer '{layer}' gives the feature name '{name}', which is not valid (1 to 100 letters, digits, '.', '-' \
-                 and '_', starting with a letter or digit); give --as PREFIX"
+                 and '_', starting with a letter or digit); give --prefix PREFIX"
             );
         }
 
         if sources[..position].iter().any(|other| other.name == *name) {
             bail!(
-                "two layers give the feature name '{name}'; encode them separately, with --as PREFIX"
+                "two layers give the feature name '{name}'; encode them separately, with --prefix PREFIX"
             );
         }
     }

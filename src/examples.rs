@@ -17,21 +17,21 @@ demo
   seese3 demo
   seese3 demo --seed 2 --out another-room
 import
-  seese3 import folder photos --room kitchen --store store
+  seese3 import folder photos --name kitchen --store store
   seese3 import colmap project --store store --scale 1
-  seese3 import bag rosbag2_hall --room hall --store store --image-topic /camera/image/compressed
-  seese3 import numpy --poses poses.npy --features mine=features.npy --room kitchen --store store
+  seese3 import bag rosbag2_hall --name hall --store store --image-topic /camera/image/compressed
+  seese3 import numpy --poses poses.npy --features mine=features.npy --name kitchen --store store
 import folder
-  seese3 import folder photos --room kitchen --store store
+  seese3 import folder photos --name kitchen --store store
 import colmap
-  seese3 import colmap project --room kitchen --store store --scale 0.37
+  seese3 import colmap project --name kitchen --store store --scale 0.37
 import 7scenes
   seese3 import 7scenes kitchen --store store --every 2
 import numpy
-  seese3 import numpy --poses poses.npy --features mine=features.npy --room kitchen --store store
+  seese3 import numpy --poses poses.npy --features mine=features.npy --name kitchen --store store
 import bag
   seese3 import bag rosbag2_hall --store store --image-topic /camera/image/compressed --pose-topic /odom
-  seese3 import bag drive.mcap --room hall --store store --world-frame map
+  seese3 import bag drive.mcap --name hall --store store --world-frame map
 check
   seese3 check room --store store --room kitchen
 check room
@@ -158,7 +158,7 @@ catalog
   seese3 catalog --server robot:50051 --json -
 health
   seese3 health
-  seese3 health --name rooms/kitchen
+  seese3 health rooms/kitchen
 completions
   seese3 completions bash > ~/.local/share/bash-completion/completions/seese3
 man

@@ -27,7 +27,8 @@ pub struct Fit {
     /// Name of the feature set; by default that of the adapter, or the room's only one
     #[arg(long)]
     features: Option<String>,
-    /// Seed of the sampled pairs, the noise and, without --adapter, the initial weights
+    /// Seed of the sampled pairs, the noise and, without --adapter, the initial weights, 0 to 2³² −
+    /// 1
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
     seed: u64,
     /// Name of the fitted adapter in the store; ROOM.FEATURES.fitted if omitted

@@ -11,8 +11,8 @@ use super::output::{JsonOutput, say};
 pub struct Health {
     #[command(flatten)]
     server: Server,
-    /// What to check: a gRPC service's full name, or rooms/NAME; the whole server if empty
-    #[arg(long, default_value = "", hide_default_value = true)]
+    /// What to check: a gRPC service's full name, or rooms/NAME; the whole server if omitted
+    #[arg(default_value = "", hide_default_value = true)]
     name: String,
     #[command(flatten)]
     json: JsonOutput,

@@ -37,6 +37,9 @@ pub struct Push {
     /// For a room: afterwards let the server fit an adapter to all of its frames
     #[arg(long, conflicts_with = "dry_run")]
     fit: bool,
+    /// With --fit: the feature set; the room's only one if omitted
+    #[arg(long, value_name = "NAME", requires = "fit")]
+    features: Option<String>,
     /// Let the server check the upload, and publish nothing
     #[arg(long)]
     dry_run: bool,
@@ -58,6 +61,7 @@ impl Push {
             Kind::Room => {
                 let stored = store.load_room(&self.name.name, self.name.revision).await?;
                 has_keypoints = stored.keypoints.is_some();
+                self.check_features(&stored)?;
                 let upload = self.upload(&stored, &target)?;
                 let messages = room_messages(stored, upload)?;
                 let answer = client.upload_room(tokio_stream::iter(messages)).await;
@@ -103,7 +107,7 @@ impl Push {
 
         let mut fitted_adapter = None;
         if self.fit {
-            let fitted = refitted(&client, &target).await?;
+            let fitted = fit_on_server(&client, &target, self.features).await?;
             fitted_adapter = Some(json!({ "name": fitted.name, "revision": fitted.revision }));
         }
 
@@ -114,6 +118,21 @@ impl Push {
             "served": served,
             "fitted_adapter": fitted_adapter,
         }))
+    }
+
+    /// Checks, before the upload, that the feature set to fit is known.
+    fn check_features(&self, stored: &StoredRoom) -> anyhow::Result<()> {
+        let sets = stored.features.iter();
+        let names: Vec<&str> = sets.map(|set| set.source().name.as_str()).collect();
+        let one = names.len() == 1;
+        let known = self
+            .features
+            .as_deref()
+            .map_or(one, |set| names.contains(&set));
+        if self.fit && !known {
+            bail!("give --features: one of {}", names.join(", "));
+        }
+        Ok(())
     }
 
     fn mode(&self) -> pb::UploadMode {
@@ -154,9 +173,14 @@ impl Push {
 }
 
 /// Lets the server fit an adapter to a room.
-async fn refitted(client: &Client, room: &ResourceName) -> anyhow::Result<pb::Revision> {
+async fn fit_on_server(
+    client: &Client,
+    room: &ResourceName,
+    features: Option<String>,
+) -> anyhow::Result<pb::Revision> {
     let request = pb::FitAdapterRequest {
         room: room.name.clone(),
+        feature_set: features.unwrap_or_default(),
         ..pb::FitAdapterRequest::default()
     };
     let fitted = client.fit_adapter(request, |_| ()).await?.revision;

@@ -59,7 +59,7 @@ pub struct Reproduce {
     /// Number of seeds, from 0 on, for tables that average over seeds
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
     seeds: u64,
-    /// Number of seeds for the table of the alternatives A to D; the paper uses 15
+    /// Number of seeds for the table of the alternatives A to D; the paper uses 15; 1 to 100
     #[arg(long, default_value_t = 15, value_parser = clap::value_parser!(u64).range(1..=100))]
     formulation_seeds: u64,
     /// Epochs, instead of every preset's own; for a quick trial

@@ -101,15 +101,15 @@ pub struct Serve {
     /// Maximum number of pixels of all images of one request, 1 to 1000000000000
     #[arg(long, env = "SEESE3_MAX_REQUEST_PIXELS", default_value_t = ImageEncoders::REQUEST_PIXELS, value_parser = clap::value_parser!(u64).range(1..=1_000_000_000_000))]
     max_request_pixels: u64,
-    /// Maximum number of steps in one navigation; requests beyond it are refused
+    /// Maximum number of steps in one navigation; requests beyond it are refused; at least 1
     #[arg(long, env = "SEESE3_MAX_STEPS", default_value_t = Limits::default().steps, value_parser = clap::value_parser!(u32).range(1..))]
     max_steps: u32,
     /// Maximum number of frames returned for one step or one localization; requests beyond it are
-    /// refused
+    /// refused; at least 1
     #[arg(long, env = "SEESE3_MAX_TOP_K", default_value_t = Limits::default().top_k, value_parser = clap::value_parser!(u32).range(1..))]
     max_top_k: u32,
     /// Maximum number of frames in one answer (steps times frames per step); requests beyond it are
-    /// refused
+    /// refused; at least 1
     #[arg(long, env = "SEESE3_MAX_FRAMES_IN_ANSWER", default_value_t = Limits::default().frames_in_answer, value_parser = clap::value_parser!(u64).range(1..))]
     max_frames_in_answer: u64,
     /// Memory limit of all requests in progress, 16777216 to 1099511627776 bytes: received data,
@@ -125,11 +125,11 @@ pub struct Serve {
     #[arg(long, env = "SEESE3_THUMBNAILS")]
     thumbnails: bool,
     /// Maximum number of stored revisions of a room, with the adapters named after it and fitted to
-    /// it; no limit if omitted
+    /// it; no limit if omitted; at least 1
     #[arg(long, env = "SEESE3_MAX_STORED_REVISIONS", value_parser = clap::value_parser!(u64).range(1..))]
     max_stored_revisions: Option<u64>,
     /// Size in the store of a room, with the adapters named after it and fitted to it, bytes, from
-    /// which on publications are refused; no limit if omitted
+    /// which on publications are refused; no limit if omitted; at least 1
     #[arg(long, env = "SEESE3_MAX_STORED_BYTES", value_parser = clap::value_parser!(u64).range(1..))]
     max_stored_bytes: Option<u64>,
     /// Memory limit of all uploads in progress, 1048576 to 1099511627776 bytes

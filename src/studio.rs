@@ -67,7 +67,7 @@ pub struct Studio {
     batch: u32,
     /// Prefix of the feature names, PREFIX-LAYER-POOLING; the model's file name without extension
     /// if omitted
-    #[arg(long = "as", value_name = "PREFIX")]
+    #[arg(long = "prefix", value_name = "PREFIX")]
     prefix: Option<String>,
     /// Also keep the images, as PNG files in the folder `images` of the store
     #[arg(long)]

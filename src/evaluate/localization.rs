@@ -53,7 +53,7 @@ pub struct Localization {
     /// Also fit an adapter to the mapped frames only, with rules that are measured on them
     #[arg(long)]
     fit: bool,
-    /// Map one frame in this many; the views of the others are localized
+    /// Map one frame in this many; the views of the others are localized; 1 to 100000
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     map_every: u32,
     /// Divide the recording into 20 blocks, leave every fifth block unmapped, and localize only the
@@ -67,10 +67,10 @@ pub struct Localization {
     /// absolute pose. PYTHON is an interpreter with numpy, opencv-python-headless and poselib
     #[arg(long, value_name = "PYTHON", conflicts_with_all = ["adapter", "fit"])]
     peer: Option<PathBuf>,
-    /// The peer locates one view in this many; the comparison is on these views
+    /// The peer locates one view in this many; the comparison is on these views; 1 to 100000
     #[arg(long, value_name = "N", default_value_t = 1, requires = "peer", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     peer_every: u32,
-    /// Seed of the fitted adapter
+    /// Seed of the fitted adapter, 0 to 2³² − 1
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
     seed: u64,
     #[command(flatten)]

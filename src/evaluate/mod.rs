@@ -137,7 +137,7 @@ struct Navigation {
     /// inverse-poincare-homogeneous
     #[arg(long, value_delimiter = ',')]
     navigators: Vec<String>,
-    /// Number of equal steps that each motion is divided into
+    /// Number of equal steps that each motion is divided into, 1 to 1000
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1_000))]
     steps: u32,
     /// How the steps are chained

@@ -29,7 +29,7 @@ pub struct Motion {
     /// adapter. The room needs keypoints
     #[arg(long)]
     keypoints: bool,
-    /// Frames from the first view to the second
+    /// Frames from the first view to the second, at least 1
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
     stride: u32,
     #[command(flatten)]

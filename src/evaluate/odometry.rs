@@ -40,7 +40,7 @@ pub struct Odometry {
     /// Which frames are mapped and which are replayed
     #[arg(long, value_parser = one_of::<HoldOut>(), default_value = "blocks")]
     hold_out: HoldOut,
-    /// Interval of the keyframes of reported motions, frames; 30 if omitted
+    /// Interval of the keyframes of reported motions, frames; 30 if omitted; 1 to 10000
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     keyframe_frames: Option<u32>,
     /// Dead reckoning only: no corrections from the map

@@ -30,7 +30,7 @@ pub struct Planning {
     /// Which frames are mapped; views of the others are the start views
     #[arg(long, value_parser = one_of::<HoldOut>(), default_value = "interleaved")]
     hold_out: HoldOut,
-    /// Number of queries in each room
+    /// Number of queries in each room, 1 to 100000
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     questions: u32,
     /// Maximum hop length, meters and radians mixed; if omitted, the root mean square of the

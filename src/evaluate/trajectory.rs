@@ -20,7 +20,7 @@ pub struct EvaluateTrajectory {
     /// Estimated path, a TUM file
     #[arg(long)]
     estimate: PathBuf,
-    /// Largest time difference at which two poses are matched, milliseconds
+    /// Largest time difference at which two poses are matched, milliseconds, 0 to 1000000
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u64).range(..=1_000_000))]
     max_difference_ms: u64,
     #[command(flatten)]
@@ -34,7 +34,7 @@ pub struct EvaluateTrajectory {
 /// Pose pairs of the relative pose error.
 #[derive(Debug, Clone, Args)]
 pub struct RelativeOptions {
-    /// RPE: number of poses from the first to the second of a pair
+    /// RPE: number of poses from the first to the second of a pair; at least 1
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     delta: u32,
     /// RPE: use all pairs at this distance, including overlapping ones, instead of consecutive

@@ -28,9 +28,9 @@ pub struct Destination {
     store: String,
     /// Name of the room in the store; if omitted, the name in an exported bundle, else derived from
     /// the path
-    #[arg(long, visible_alias = "room")]
+    #[arg(long)]
     pub name: Option<String>,
-    /// Keep every K-th usable frame of each sequence
+    /// Keep every K-th usable frame of each sequence, at least 1
     #[arg(long, value_name = "K", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
     /// Fail and publish nothing, instead of warning. Reasons: an unusable frame; an unreadable

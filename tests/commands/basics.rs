@@ -126,9 +126,9 @@ fn a_served_room_is_asked_and_the_server_stops_when_told() {
         &["room 'r' revision 1: 600 frames"],
     );
 
-    let health = format!("health {to} --name rooms");
+    let health = format!("health {to} rooms");
     assert_eq!(here.succeeds(&format!("{health}/r")), "serving\n");
-    here.refuses(&format!("{health}/x"), &["NotFound"]);
+    here.refuses(&format!("{health}/x"), &["NOT_FOUND"]);
 
     let still = "navigate --room r --from 7 --twist 0,0,0,0,0,0 --steps 2";
     here.prints(
@@ -168,7 +168,7 @@ fn a_served_room_is_asked_and_the_server_stops_when_told() {
     assert_eq!(motion(&of_rows), motion(of_frames));
 
     let elsewhere = format!("navigate --room x --from 7 --to 9 {to}");
-    here.refuses(&elsewhere, &["NotFound", "room"]);
+    here.refuses(&elsewhere, &["NOT_FOUND", "room"]);
 
     let again = format!("serve --store store --listen {}", server.address);
     here.refuses(&again, &["cannot listen on", &server.address]);
@@ -203,7 +203,7 @@ fn bad_input_gets_one_line() {
         ("../r", "f=golden/rooms/synthetic/features.npy", &["../r"]),
     ] {
         let poses = "--poses golden/rooms/synthetic/poses.npy";
-        let import = format!("import numpy --room {room} {poses} --features {features}");
+        let import = format!("import numpy --name {room} {poses} --features {features}");
         here.refuses(&format!("{import} --store store"), words);
     }
 
@@ -240,4 +240,29 @@ fn bad_input_gets_one_line() {
     let nobody = format!("{navigate} --server 127.0.0.1:1 --to 2");
     here.refuses(&nobody, &["cannot connect"]);
     here.refuses(&format!("{navigate} --twist 1,2"), &["six numbers"]);
+}
+
+/// Oracle: the contract: nothing is uploaded before the feature set to fit is known.
+#[test]
+fn a_pushed_room_is_fitted_with_the_named_feature_set() {
+    let here = Place::new();
+    here.succeeds("import numpy --name kept --poses golden/rooms/synthetic_b/poses.npy --store store");
+    let both = Place::import("r", "synthetic").replace("--store store", "--store source");
+    let second = "--features second=golden/rooms/synthetic/features.npy";
+    here.succeeds(&format!("{both} {second}"));
+
+    let server = here.serve("--writable");
+    let push = format!("push rooms/r --store source --server {} --fit", server.address);
+    here.refuses(&push, &["--features: one of fourier, second"]);
+    here.refuses(&format!("{push} --features third"), &["one of fourier, second"]);
+    here.refuses(
+        &format!("catalog rooms/r --server {}", server.address),
+        &["'r' is not served"],
+    );
+    here.prints(
+        &format!("{push} --features second --json pushed.json"),
+        &["adapters/r.second.fitted/revisions/1"],
+    );
+    let fitted = &here.json("pushed.json")["fitted_adapter"];
+    assert_eq!(fitted["name"], "r.second.fitted");
 }

@@ -23,7 +23,7 @@ pub fn import(here: &Place, version: u32, store: &str) -> String {
     ndarray_npy::write_npy(here.file(&file), &rows).unwrap();
 
     let poses = "golden/rooms/synthetic/poses.npy";
-    format!("import numpy --room a --poses {poses} --features f={file} --store {store}")
+    format!("import numpy --name a --poses {poses} --features f={file} --store {store}")
 }
 
 /// The revision that the room has now, after `store verify` found nothing wrong.

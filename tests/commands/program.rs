@@ -40,7 +40,7 @@ impl Place {
         let folder = format!("golden/rooms/{golden_room}");
         let features = format!("fourier={folder}/features.npy");
         let poses = format!("{folder}/poses.npy");
-        format!("import numpy --room {room} --poses {poses} --features {features} --store store")
+        format!("import numpy --name {room} --poses {poses} --features {features} --store store")
     }
 
     pub fn run(&self, arguments: &str) -> Output {

@@ -145,7 +145,7 @@ fn a_suite_is_drawn_once_and_encodes_as_its_images_do() {
     let streamed = features(&here, "store", "studio3-0001", "builtin");
     assert_eq!(streamed.dim(), (24, 528));
 
-    let encode = "encode --store store --room studio3-0001 --encoder builtin --as kept";
+    let encode = "encode --store store --room studio3-0001 --encoder builtin --prefix kept";
     here.prints(encode, &["encoded 24 frames"]);
     assert_eq!(features(&here, "store", "studio3-0001", "kept"), streamed);
     here.prints(encode, &["already there"]);
@@ -217,7 +217,7 @@ fn a_corrupt_image_is_named_or_left_out() {
     );
 
     let long = "x".repeat(101);
-    here.refuses(&format!("{ENCODE} --as {long}"), &["--as PREFIX"]);
+    here.refuses(&format!("{ENCODE} --prefix {long}"), &["--prefix PREFIX"]);
 }
 
 /// Oracle: what was encoded before an image was written anew is not taken for it.

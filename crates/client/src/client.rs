@@ -87,12 +87,27 @@ impl Error {
 fn described(status: &Status) -> String {
     let Some(mut cause) = std::error::Error::source(status) else {
         let message = one_line(status.message());
-        return format!("the server refused ({:?}): {message}", status.code());
+        return format!(
+            "{message} (refused by the server, {})",
+            code_name(status.code())
+        );
     };
     while let Some(next) = cause.source() {
         cause = next;
     }
     format!("the connection to the server broke: {cause}")
+}
+
+/// The name of a code as in the gRPC documentation, such as `NOT_FOUND` for [`Code::NotFound`].
+fn code_name(code: Code) -> String {
+    let mut name = String::new();
+    for letter in format!("{code:?}").chars() {
+        if letter.is_ascii_uppercase() && !name.is_empty() {
+            name.push('_');
+        }
+        name.push(letter.to_ascii_uppercase());
+    }
+    name
 }
 
 impl From<Status> for Error {
@@ -302,7 +317,7 @@ mod tests {
         let refused = Error::from(Status::not_found("no\nroom"));
         assert_eq!(
             refused.to_string(),
-            "the server refused (NotFound): no room"
+            "no room (refused by the server, NOT_FOUND)"
         );
 
         let cause = std::io::Error::other("the peer is gone");

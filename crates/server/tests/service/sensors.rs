@@ -336,7 +336,7 @@ async fn measurements_that_are_none_are_refused() {
         (
             others(&["third"], row_of("hall", 1)),
             Reason::View,
-            "other_views[0].camera: must be one of: second",
+            "other_views[0].camera_name: must be one of: second",
         ),
         (
             others(&["second", "second"], row_of("hall", 1)),
