@@ -22,7 +22,7 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
     let room = arguments.next().unwrap_or("studio".to_owned());
     let client = Client::connect(&address, DEADLINE).await?;
 
-    // Half a metre forward and a little to the left, in the camera's own frame: x right, y down,
+    // Half a meter forward and a little to the left, in the camera's own frame: x right, y down,
     // z forward.
     let motion = convert::Twist {
         linear: Vector3::new(0.0, 0.0, 0.5),

@@ -4,7 +4,7 @@
     python export_encoder.py timm vit_small_patch14_dinov2.lvd142m
     python export_encoder.py transformers facebook/dinov2-small
 
-Writes NAME.onnx with one output for each block, `block0` and so on, before the model's last normalisation; NAME.onnx.data with
+Writes NAME.onnx with one output for each block, `block0` and so on, before the model's last normalization; NAME.onnx.data with
 the weights; and NAME.json, which says how its images are prepared. Prints the command that encodes a room with them.
 """
 

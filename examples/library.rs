@@ -89,7 +89,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         println!(
             "step {}: frame {}, {error_m:.2} m from where it should be",
             number + 1,
-            hit.neighbour.frame
+            hit.neighbor.frame
         );
     }
 

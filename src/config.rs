@@ -284,7 +284,7 @@ mod tests {
 
         for (text, word) in [
             ("max-stream = 7", "did you mean 'max-streams'"),
-            ("colour = \"red\"", "'colour' is not a setting"),
+            ("color = \"red\"", "'color' is not a setting"),
             ("queue = true", "'queue' must be"),
             ("queue = ", "seese3.toml"),
         ] {

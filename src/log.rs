@@ -83,13 +83,13 @@ pub fn start_log(format: LogFormat, traces: Option<&Traces>) -> Log {
         EnvFilter::new("info,hnsw_rs=warn,opentelemetry=off,opentelemetry_sdk=off,opentelemetry-otlp=off,opentelemetry_otlp=off")
     });
     // As no-color.org specifies, any non-empty NO_COLOR turns colors off.
-    let no_colour = std::env::var_os("NO_COLOR").is_some_and(|set| !set.is_empty());
-    let is_coloured = io::stderr().is_terminal() && !no_colour;
+    let no_color = std::env::var_os("NO_COLOR").is_some_and(|set| !set.is_empty());
+    let is_colored = io::stderr().is_terminal() && !no_color;
     let log = tracing_subscriber::fmt::layer()
         // A request is logged once, when its span closes.
         .with_span_events(FmtSpan::CLOSE)
         .with_writer(writer)
-        .with_ansi(is_coloured)
+        .with_ansi(is_colored)
         // Internal errors would be printed to standard error, which panics if that cannot be
         // written.
         .log_internal_errors(false);

@@ -86,8 +86,8 @@ fn with_advice(warning: &PoseWarning, from: PosesFrom) -> String {
             Some("--scale 0.001 or --scale 0.01".to_owned())
         }
         PoseWarning::Depth { unit, .. } => Some(match unit {
-            LengthUnit::Millimetres => "--scale 0.001".to_owned(),
-            LengthUnit::Centimetres => "--scale 0.01".to_owned(),
+            LengthUnit::Millimeters => "--scale 0.001".to_owned(),
+            LengthUnit::Centimeters => "--scale 0.01".to_owned(),
             LengthUnit::Unknown => "--scale FACTOR".to_owned(),
         }),
         PoseWarning::Focal { .. } => Some("--camera".to_owned()),

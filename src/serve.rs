@@ -240,7 +240,7 @@ impl Serve {
             // An error means that the server ended by itself.
             let _ = asked.send(());
         };
-        let signalled_twice = async move {
+        let signaled_twice = async move {
             match again.await {
                 Ok(()) => shutdown_signal().await,
                 Err(_) => std::future::pending().await,
@@ -250,7 +250,7 @@ impl Serve {
         tokio::select! {
             ended = run(listeners, store, config, stopping) => ended?,
             // A second signal skips the wait for requests in flight.
-            () = signalled_twice => bail!("received a second signal: requests in flight were aborted"),
+            () = signaled_twice => bail!("received a second signal: requests in flight were aborted"),
         }
 
         match log.losses().count() {

@@ -258,7 +258,7 @@ impl Studio {
             .collect();
         let mut provenance = Provenance {
             format: format!("studio {}{without}", film.kind),
-            licence: "CC0-1.0".to_owned(),
+            license: "CC0-1.0".to_owned(),
             camera: Some(film.camera(width, height)?),
             ..Provenance::default()
         };

@@ -5,7 +5,7 @@
     python two_view_sift.py FOLDER --stride 9 --drift [--sequence 1]
 
 Reads the pairs that `seese3 evaluate motion --stride 10` reads, or every N-th of them, and prints the same errors: medians and
-90 % quantiles in metres and degrees. SIFT (2,000 features, ratio test at 0.8) and MAGSAC with a threshold
+90 % quantiles in meters and degrees. SIFT (2,000 features, ratio test at 0.8) and MAGSAC with a threshold
 of one pixel in 640; a pair with fewer than 8 matches or inliers counts as no motion. An essential matrix
 has no scale: the true length of the translation is given to it. Needs numpy and opencv-python-headless.
 
@@ -135,10 +135,10 @@ def main():
         return
     print("motion by                          median m  90 % m  median °  90 % °")
     for name, rows in (("SIFT, with the true length", errors), ("no motion", still)):
-        metres, degrees = np.array(rows).T
+        meters, degrees = np.array(rows).T
         q = lambda values, share: np.quantile(values, share)
         print(
-            f"{name:34} {q(metres, .5):8.4f} {q(metres, .9):7.3f}"
+            f"{name:34} {q(meters, .5):8.4f} {q(meters, .9):7.3f}"
             f" {q(degrees, .5):9.2f} {q(degrees, .9):7.1f}"
         )
 

@@ -280,14 +280,14 @@ fn deviations_text(covariance: &[f64]) -> String {
     };
 
     let deviation = |part: &[f64]| part.iter().sum::<f64>().sqrt();
-    let metres = deviation(&variances[..3]);
+    let meters = deviation(&variances[..3]);
     let degrees = deviation(&variances[3..]).to_degrees();
 
     // A rotation error is at most 180°.
     if degrees < 180.0 {
-        format!(", ± {metres:.3} m, ± {degrees:.2}°")
+        format!(", ± {meters:.3} m, ± {degrees:.2}°")
     } else {
-        format!(", ± {metres:.3} m, rotation unknown")
+        format!(", ± {meters:.3} m, rotation unknown")
     }
 }
 

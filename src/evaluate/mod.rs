@@ -349,7 +349,7 @@ fn motion_baselines(
         motion: MotionScores::of(&motions(room.poses(), &pairs), &predicted),
         baselines: Baselines::of(
             adapter.scale(),
-            record.optimiser_steps(),
+            record.optimizer_steps(),
             room,
             &test,
             learned_here,

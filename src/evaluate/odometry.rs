@@ -7,12 +7,12 @@ use std::sync::{Mutex, PoisonError};
 use anyhow::Context;
 use clap::Args;
 use seese3_core::splits::HoldOut;
-use seese3_lab::experiments::odometry::{Relocalisation, RoomOdometry, evaluate, relocalisation};
+use seese3_lab::experiments::odometry::{Relocalization, RoomOdometry, evaluate, relocalization};
 use seese3_lab::experiments::replay::Replay;
 use seese3_lab::experiments::tracked_room::TrackingProtocol;
 use seese3_lab::report::{
     APE_FORMULA, Table, coverage_table, intervals_table, odometry_json, odometry_table,
-    other_rooms_text, relocalisation_text, scenarios_text,
+    other_rooms_text, relocalization_text, scenarios_text,
 };
 use seese3_robot::pose_filter::FilterParameters;
 
@@ -83,14 +83,14 @@ impl Odometry {
         let recordings = Recordings::load(&store, &self.rooms, adapter, &self.views).await?;
 
         let pool = self.views.runtime.pool()?;
-        let (tracked, relocalised) = pool.install(|| -> anyhow::Result<_> {
+        let (tracked, relocalized) = pool.install(|| -> anyhow::Result<_> {
             let rooms = recordings.tracked(&|of_room| self.protocol(given.or(of_room)))?;
             let tracked = self.tracked(rooms.len(), |done| evaluate(&rooms, done))?;
             // Relocalization of features needs at least two rooms to choose from.
-            let relocalised = (adapter.is_some() && rooms.len() > 1)
-                .then(|| relocalisation(&rooms))
+            let relocalized = (adapter.is_some() && rooms.len() > 1)
+                .then(|| relocalization(&rooms))
                 .transpose()?;
-            Ok((tracked, relocalised))
+            Ok((tracked, relocalized))
         })?;
 
         let how = if self.no_fusion {
@@ -102,7 +102,7 @@ impl Odometry {
         } else {
             "fused with located views"
         };
-        self.report(&tracked, &recordings.words(), how, relocalised.as_ref())
+        self.report(&tracked, &recordings.words(), how, relocalized.as_ref())
     }
 
     /// Evaluates with a progress bar. Paths are written as each room completes; the first failure
@@ -137,7 +137,7 @@ impl Odometry {
         tracked: &[RoomOdometry],
         what: &str,
         how: &str,
-        relocalised: Option<&Relocalisation>,
+        relocalized: Option<&Relocalization>,
     ) -> anyhow::Result<()> {
         say(format_args!(
             "{} {}, {what}, hold-out {}, {how}",
@@ -163,14 +163,14 @@ impl Odometry {
         if tracked.len() > 1 {
             say(other_rooms_text(tracked));
         }
-        if let Some(found) = relocalised {
-            say(relocalisation_text(found));
+        if let Some(found) = relocalized {
+            say(relocalization_text(found));
         }
 
         say(format_args!(
             "{APE_FORMULA}; root mean square without alignment"
         ));
-        self.json.write(&odometry_json(tracked, relocalised))
+        self.json.write(&odometry_json(tracked, relocalized))
     }
 
     fn protocol(&self, parameters: Option<FilterParameters>) -> TrackingProtocol {

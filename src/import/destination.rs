@@ -191,7 +191,7 @@ impl Destination {
         };
         let provenance = Provenance {
             format: either(&stated.format, format),
-            licence: either(&self.license, &stated.licence),
+            license: either(&self.license, &stated.license),
             images_root: recording.images_root.clone(),
             worst_rotation_deviation: recording.worst_rotation_deviation,
             camera: self

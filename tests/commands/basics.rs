@@ -246,15 +246,23 @@ fn bad_input_gets_one_line() {
 #[test]
 fn a_pushed_room_is_fitted_with_the_named_feature_set() {
     let here = Place::new();
-    here.succeeds("import numpy --name kept --poses golden/rooms/synthetic_b/poses.npy --store store");
+    here.succeeds(
+        "import numpy --name kept --poses golden/rooms/synthetic_b/poses.npy --store store",
+    );
     let both = Place::import("r", "synthetic").replace("--store store", "--store source");
     let second = "--features second=golden/rooms/synthetic/features.npy";
     here.succeeds(&format!("{both} {second}"));
 
     let server = here.serve("--writable");
-    let push = format!("push rooms/r --store source --server {} --fit", server.address);
+    let push = format!(
+        "push rooms/r --store source --server {} --fit",
+        server.address
+    );
     here.refuses(&push, &["--features: one of fourier, second"]);
-    here.refuses(&format!("{push} --features third"), &["one of fourier, second"]);
+    here.refuses(
+        &format!("{push} --features third"),
+        &["one of fourier, second"],
+    );
     here.refuses(
         &format!("catalog rooms/r --server {}", server.address),
         &["'r' is not served"],

@@ -315,7 +315,7 @@ fn an_adapter_is_fitted_and_its_views_are_located() {
     assert!(number(&baselines["constant_r2"]) < 1.0 && number(&baselines["variance_ratio"]) > 0.0);
     let nearest = &baselines["nearest_pose"];
     assert!(nearest.is_null(), "the adapter never saw the room");
-    assert!(baselines["optimiser_steps"].as_u64().unwrap() > 0);
+    assert!(baselines["optimizer_steps"].as_u64().unwrap() > 0);
 
     let fit = "fit --store store --room a --name fitted";
     here.prints(fit, &["published adapter 'fitted' revision 1"]);

@@ -62,7 +62,7 @@ fn recordings_are_imported_once_and_given_back() {
         "import bundle out --store store --name copy",
         &["room 'copy': 2 frames with timestamps"],
     );
-    assert_eq!(here.json("out/bundle.json")["licence"], "CC-BY");
+    assert_eq!(here.json("out/bundle.json")["license"], "CC-BY");
 
     here.succeeds("export tum --store store --room tum --out tum.txt");
 

@@ -77,8 +77,8 @@ def mistakes(poses: np.ndarray, other: np.ndarray) -> dict[str, tuple[np.ndarray
         "images turned by 90": (turned(poses, 1), named, "--images-turned 90"),
         "images turned by 180": (turned(poses, 2), named, "--images-turned 180"),
         "scalar first": (scalar_first(poses), named, "--quaternions wxyz"),
-        "millimetres": (with_translations(poses, 1000 * t), "warning", "millimeters"),
-        "centimetres": (with_translations(poses, 100 * t), "warning", "centimeters"),
+        "millimeters": (with_translations(poses, 1000 * t), "warning", "millimeters"),
+        "centimeters": (with_translations(poses, 100 * t), "warning", "centimeters"),
         "a scale of .137": (with_translations(poses, 0.137 * t), "warning", "in meters?"),
         "y and z exchanged": (with_translations(poses, t[:, [0, 2, 1]]), "other_translations", "(x, z, y)"),
         "translations of the inverse": (

@@ -402,7 +402,7 @@ def _wheel_factor(file: Path, centers: dict[str, Floats], times: dict[str, float
     driven = np.stack([np.interp(at, stamps, path[:, axis]) for axis in range(3)], axis=1)
     seen = np.stack([centers[name] for name in order])
 
-    # Straight distances over a tenth of a metre: odometry has little drift there.
+    # Straight distances over a tenth of a meter: odometry has little drift there.
     ratios, begin = [], 0
     for end in range(1, len(order)):
         meters = float(np.linalg.norm(driven[end] - driven[begin]))

@@ -299,7 +299,7 @@ class Store:
         for set_name in sets:
             _check_name("set of features", set_name)
 
-        described: dict[str, Any] = {"format": "seese3 bundle 1", "licence": license}
+        described: dict[str, Any] = {"format": "seese3 bundle 1", "license": license}
         described["recorded_as"] = format or self._recorded_as(name) or "numpy"
         described["features"] = [_stated_source(source) for source, _ in sets.values()]
         if names is not None:

@@ -103,7 +103,7 @@ def test_localization_of_features_and_images(client: seese3.Client, drawn: Path)
     for view in views:
         found = client.localize(view, rooms=ROOM, top_k=3)
         assert found.frames[0].frame.id == 33 and len(found.frames) == 3
-        # A mapped view lies within the room's limit, and its pose is known to some centimetres.
+        # A mapped view lies within the room's limit, and its pose is known to some centimeters.
         assert found.pose is not None and found.novelty is not None and found.novelty < 1
         assert found.room.name == ROOM and found.method in ("fitted_adapter", "similar_frames")
         assert np.linalg.norm(found.pose[:3, 3] - room.poses[33][:3, 3]) < 0.05

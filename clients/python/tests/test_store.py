@@ -300,7 +300,7 @@ def test_a_license_is_kept_by_those_who_add_features(tmp_path: Path) -> None:
     store.write_room("hall", stated, {"a": np.ones((3, 2))}, license="CC BY 4.0", format="mine")
     store.write_room("hall", stated, {"b": np.ones((3, 2))})
     provenance = store.room("hall").manifest["provenance"]
-    assert (provenance["licence"], provenance["format"]) == ("CC BY 4.0", "mine")
+    assert (provenance["license"], provenance["format"]) == ("CC BY 4.0", "mine")
 
 
 def test_unfit_adapters_are_refused_and_leave_nothing(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ def raw(encoding, rows, step):
     ("bgra8", b"\x00\x00\xff\x80", (255, 0, 0)),
     ("mono8", b"\x4c", 76),
 ])
-def test_raw_images_keep_their_colours_and_lose_their_padding(encoding, bytes_of_red, expected):
+def test_raw_images_keep_their_colors_and_lose_their_padding(encoding, bytes_of_red, expected):
     row = bytes_of_red * 2 + b"\x99\x99"
     view = requests.view_of_raw(raw(encoding, [row, row, row], len(row)))
     picture = Picture.open(io.BytesIO(view.image))

@@ -56,10 +56,10 @@ impl RgbImage {
 mod tests {
     use super::*;
 
-    fn image(colour: impl Fn(usize, usize) -> u8) -> RgbImage {
+    fn image(color: impl Fn(usize, usize) -> u8) -> RgbImage {
         let (width, height) = (64, 48);
         let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
-        let bytes = pixels.flat_map(|(x, y)| [colour(x, y); 3]).collect();
+        let bytes = pixels.flat_map(|(x, y)| [color(x, y); 3]).collect();
         RgbImage {
             width,
             height,

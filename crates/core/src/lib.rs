@@ -46,7 +46,7 @@
 //! let latents = navigator.latents();
 //! let motion = navigator.adapter().motion(latents.row(10), latents.row(15));
 //! assert!(motion.is_finite());
-//! assert_eq!(navigator.nearest(latents.row(10), 3)[0].neighbour.frame.row(), 10);
+//! assert_eq!(navigator.nearest(latents.row(10), 3)[0].neighbor.frame.row(), 10);
 //! # Ok(()) }
 //! ```
 //!

@@ -41,12 +41,12 @@ pub fn localize<'a>(
         places.sort_by(|a, b| {
             let distance = a
                 .frame
-                .neighbour
+                .neighbor
                 .distance
-                .total_cmp(&b.frame.neighbour.distance);
+                .total_cmp(&b.frame.neighbor.distance);
             distance
                 .then_with(|| a.room.cmp(&b.room))
-                .then(a.frame.neighbour.frame.cmp(&b.frame.neighbour.frame))
+                .then(a.frame.neighbor.frame.cmp(&b.frame.neighbor.frame))
         });
 
         places.truncate(k);

@@ -67,13 +67,13 @@ impl Ridge {
         }
 
         // Centering inputs and targets fits the intercept without a penalty.
-        let centre = |rows: ArrayView2<'_, f64>| match intercept {
+        let center = |rows: ArrayView2<'_, f64>| match intercept {
             Intercept::Fitted => rows.sum_axis(Axis(0)) / rows.nrows() as f64,
             Intercept::None => Array1::zeros(rows.ncols()),
         };
-        let input_mean = centre(inputs);
+        let input_mean = center(inputs);
 
-        let target_mean = centre(targets);
+        let target_mean = center(targets);
         let x = &inputs - &input_mean;
         let y = &targets - &target_mean;
 

@@ -153,7 +153,8 @@ pub struct Provenance {
     /// Source format, for instance `7scenes`.
     pub format: String,
     /// License of the data, if stated.
-    pub licence: String,
+    #[cfg_attr(feature = "serde", serde(alias = "licence"))]
+    pub license: String,
     /// Base folder of the image paths; empty if the room has no images.
     pub images_root: String,
     /// Largest entry of |RRᵀ − I| over all rotations, before the projection onto SO(3).

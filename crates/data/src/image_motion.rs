@@ -210,7 +210,7 @@ fn refine(first: &SmallImage, second: &SmallImage, warp: &mut Vector4<f64>) -> O
     }
 
     let overlap = overlap(first, second, warp)?;
-    let [first, second] = standardised(&overlap)?;
+    let [first, second] = standardized(&overlap)?;
     let products = first.iter().zip(&second).map(|(a, b)| a * b);
     Some(products.sum::<f64>() / overlap.len() as f64)
 }
@@ -246,7 +246,7 @@ fn overlap(first: &SmallImage, second: &SmallImage, warp: &Vector4<f64>) -> Opti
 
 /// The brightness of both images, standardized to mean 0 and deviation 1 to cancel exposure. `None`
 /// if one of them is uniform.
-fn standardised(overlap: &[Overlap]) -> Option<[Vec<f64>; 2]> {
+fn standardized(overlap: &[Overlap]) -> Option<[Vec<f64>; 2]> {
     let values = [
         overlap.iter().map(|both| both.first).collect(),
         overlap.iter().map(|both| both.second.brightness).collect(),
@@ -272,7 +272,7 @@ fn mean_and_deviation(values: &[f64]) -> (f64, f64) {
 
 /// One Gauss-Newton step, to be added to the warp.
 fn step(overlap: &[Overlap]) -> Option<Vector4<f64>> {
-    let [first, second] = standardised(overlap)?;
+    let [first, second] = standardized(overlap)?;
     let brightness: Vec<f64> = overlap.iter().map(|both| both.second.brightness).collect();
     let (_, deviation) = mean_and_deviation(&brightness);
 

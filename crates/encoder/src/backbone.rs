@@ -156,13 +156,13 @@ fn runner(
 /// The clip axis of a model's input. An input (batch, 3, height, width) has none; (batch, 3, clip,
 /// height, width) and (batch, clip, 3, height, width) have one.
 fn clip_axis(input: &[Option<usize>], window: usize) -> Result<Option<usize>, String> {
-    let colours = |axis: usize| matches!(input[axis], None | Some(3));
+    let colors = |axis: usize| matches!(input[axis], None | Some(3));
 
     // With five axes, the one of size 3 is the channels; the other one before the height is the
     // clip. `fixed` is the length of a clip, if the file states it.
     let (axis, fixed) = match input.len() {
-        4 if colours(1) && window == 1 => return Ok(None),
-        4 if colours(1) => {
+        4 if colors(1) && window == 1 => return Ok(None),
+        4 if colors(1) => {
             return Err(format!(
                 "takes single images, not clips of {window}; leave out --window"
             ));
@@ -207,7 +207,7 @@ mod tests {
 
     /// Oracle: the shapes by hand.
     #[test]
-    fn a_clip_is_found_by_its_place_beside_the_colours() {
+    fn a_clip_is_found_by_its_place_beside_the_colors() {
         let n = None;
         assert_eq!(clip_axis(&[n, Some(3), Some(240), Some(320)], 1), Ok(None));
         assert_eq!(clip_axis(&[n, Some(3), n, n], 1), Ok(None));

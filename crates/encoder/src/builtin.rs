@@ -102,20 +102,20 @@ pub fn encode_builtin(image: &RgbImage) -> Vec<f32> {
     // Sums become means over the cell, so that features do not depend on the number of pixels. The
     // square root reduces the dominance of strong edges.
     for (cell, values) in feature.chunks_exact_mut(CELL_DIM).enumerate() {
-        let (histogram, colour) = values.split_at_mut(ORIENTATIONS);
+        let (histogram, color) = values.split_at_mut(ORIENTATIONS);
         let area = weight[cell].max(1e-6);
         histogram
             .iter_mut()
             .for_each(|value| *value = (8.0 * *value / area).sqrt());
 
-        colour.iter_mut().for_each(|value| *value /= area);
+        color.iter_mut().for_each(|value| *value /= area);
     }
 
     feature
 }
 
 /// The four cells around a pixel, each with the pixel's share in it. Shares are the weights of
-/// bilinear interpolation between the centres of the cells, and add up to 1.
+/// bilinear interpolation between the centers of the cells, and add up to 1.
 fn cells_of(x: usize, y: usize, width: usize, height: usize) -> [(usize, f32); 4] {
     let place = |pixel: usize, pixels: usize, cells: usize| {
         // The pixel's center in units of cells, relative to the center of the first cell. It is
@@ -170,7 +170,7 @@ mod tests {
 
     /// Oracle: by hand. A uniform image has no gradient, and its own color in every cell.
     #[test]
-    fn a_uniform_image_is_its_colour() {
+    fn a_uniform_image_is_its_color() {
         let image = RgbImage {
             width: 10,
             height: 7,

@@ -243,7 +243,7 @@ fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
     check_size(width, height, bounds)?;
     let bytes = decoder.decode().map_err(|error| error.to_string())?;
     let image = image::RgbImage::from_raw(width as u32, height as u32, bytes)
-        .ok_or("has colours that cannot be converted to RGB")?;
+        .ok_or("has colors that cannot be converted to RGB")?;
 
     let exif = decoder
         .exif()

@@ -1,6 +1,6 @@
 //! Encoders: images to features, several layers in one pass.
 //!
-//! - An image is decoded, resized and cropped in 8 bit, normalised, and run through a network; the
+//! - An image is decoded, resized and cropped in 8 bit, normalized, and run through a network; the
 //!   output of each layer is pooled to one row.
 //! - The [`FeatureSource`] of features records everything that determines them, so that the
 //!   [`Encoder`] can be rebuilt from a source and the model's file alone.
@@ -48,7 +48,7 @@ pub use decode::{
 pub use journal::{EncodedFrame, Journal, NumberedFrames};
 pub use keypoints::KeypointOutputs;
 pub use pooling::Pooling;
-pub use preparation::{Filter, Preparation, Resize, normalised};
+pub use preparation::{Filter, Preparation, Resize, normalized};
 pub use preprocess::Preprocess;
 pub use preprocess_file::read_preprocess_file;
 pub use recipes::{EncoderRecipe, RECIPES, recipe};
@@ -622,7 +622,7 @@ impl Encoder {
         let mut numbers = Vec::with_capacity(clips.len() * self.window * 3 * width * height);
         for clip in clips {
             for image in clip {
-                normalised(&self.preparation, image, &mut numbers);
+                normalized(&self.preparation, image, &mut numbers);
             }
         }
 

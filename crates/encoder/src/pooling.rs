@@ -214,7 +214,7 @@ impl InputSize {
 }
 
 /// Means over the cells of a map (C, H, W). Cell i of n covers ⌊iH/n⌋ up to but not including
-/// ⌈(i+1)H/n⌉, so that neighbouring cells overlap where n does not divide H.
+/// ⌈(i+1)H/n⌉, so that neighboring cells overlap where n does not divide H.
 fn grid(map: ArrayView3<'_, f32>, columns: usize, rows: usize) -> Vec<f32> {
     let (channels, height, width) = map.dim();
     let cell = |i: usize, n: usize, length: usize| i * length / n..((i + 1) * length).div_ceil(n);

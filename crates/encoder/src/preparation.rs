@@ -375,7 +375,7 @@ fn cropped(image: &RgbImage, width: usize, height: usize) -> Result<RgbImage, Er
 }
 
 /// Appends the normalized values of an image to `numbers`, plane by plane: red, green, blue.
-pub fn normalised(preparation: &Preparation, image: &RgbImage, numbers: &mut Vec<f32>) {
+pub fn normalized(preparation: &Preparation, image: &RgbImage, numbers: &mut Vec<f32>) {
     let Preparation {
         divisor,
         mean,
@@ -416,7 +416,7 @@ mod tests {
     }
 
     /// Oracle: by hand. 641×480 with its shorter edge at 240 is 320×240 (cut, not rounded); a
-    /// centre crop of 100×50 begins at ((320 − 100) / 2, (240 − 50) / 2).
+    /// center crop of 100×50 begins at ((320 − 100) / 2, (240 − 50) / 2).
     #[test]
     fn sizes_are_cut_and_crops_are_central() {
         let preparation = Preparation {
@@ -498,7 +498,7 @@ mod tests {
 
     /// Oracle: the formula by hand, and planes in the order red, green, blue.
     #[test]
-    fn channels_are_normalised_each_by_its_own_numbers() {
+    fn channels_are_normalized_each_by_its_own_numbers() {
         let preparation = Preparation {
             divisor: 2.0,
             mean: [1.0, 2.0, 3.0],
@@ -513,7 +513,7 @@ mod tests {
         };
 
         let mut numbers = Vec::new();
-        normalised(&preparation, &image, &mut numbers);
+        normalized(&preparation, &image, &mut numbers);
         assert_eq!(numbers, [0.0, 4.0, 0.0, 4.0, 0.0, 3.0]);
     }
 

@@ -207,8 +207,8 @@ fn of_transformers(config: &TransformersConfig) -> Result<Preparation, String> {
         }
     };
 
-    let is_normalised = config.do_normalize.unwrap_or(true);
-    let three = |given: Option<[f32; 3]>, field: &str, otherwise: f32| match (is_normalised, given)
+    let is_normalized = config.do_normalize.unwrap_or(true);
+    let three = |given: Option<[f32; 3]>, field: &str, otherwise: f32| match (is_normalized, given)
     {
         (false, _) => Ok([otherwise; 3]),
         (true, Some(numbers)) => Ok(numbers),

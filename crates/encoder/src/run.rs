@@ -177,7 +177,7 @@ fn prepare(task: &Task<'_>, encoder: &Encoder, anchors: &[usize]) -> Result<Clip
         .map(|&row| clip(task.timeline, row, encoder.window()))
         .collect();
 
-    // The clips of neighbouring frames overlap, and each image is read only once.
+    // The clips of neighboring frames overlap, and each image is read only once.
     let mut wanted: Vec<usize> = frames.iter().flatten().copied().collect();
     wanted.sort_unstable();
 

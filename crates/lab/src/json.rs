@@ -142,7 +142,7 @@ pub struct BaselinesJson {
     constant_r2: f64,
     variance_ratio: f64,
     nearest_pose: Option<NearestPoseJson>,
-    optimiser_steps: u64,
+    optimizer_steps: u64,
     /// False if the constant's R² is so far below zero that the recording cannot rate an adapter.
     can_tell: bool,
 }
@@ -163,7 +163,7 @@ impl From<&Baselines> for BaselinesJson {
                 m: nearest.translation_m,
                 deg: nearest.rotation_rad.to_degrees(),
             }),
-            optimiser_steps: baselines.optimiser_steps,
+            optimizer_steps: baselines.optimizer_steps,
             can_tell: baselines.can_tell(),
         }
     }

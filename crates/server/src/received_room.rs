@@ -324,7 +324,7 @@ fn finished(received: ReceivedRoom, end: &pb::UploadEnd) -> Result<CompleteRoom,
 
     let provenance = Provenance {
         format: upload.format.clone(),
-        licence: upload.license.clone(),
+        license: upload.license.clone(),
         images_root: String::new(),
         worst_rotation_deviation: received.worst_rotation_deviation,
         camera: upload

@@ -428,10 +428,10 @@ fn room_to_wire(
     located.add_fitted(served, query.feature)?;
 
     // Distances are in standard deviations of frame noise, unlike those of Localize.
-    let retrieved = |neighbour: &seese3_core::index::Neighbour| {
+    let retrieved = |neighbor: &seese3_core::index::Neighbor| {
         let retrieved = RetrievedFrame {
-            neighbour: *neighbour,
-            pose: room.poses()[neighbour.frame.row()],
+            neighbor: *neighbor,
+            pose: room.poses()[neighbor.frame.row()],
         };
         convert::retrieved_to_wire(&retrieved, room)
     };

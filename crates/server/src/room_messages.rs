@@ -49,7 +49,7 @@ pub fn room_upload(stored: &StoredRoom) -> Result<pb::RoomUpload, Unsendable> {
         room: stored.room.id().to_string(),
         feature_sources: sources.map(source_to_wire).collect(),
         format: provenance.format.clone(),
-        license: provenance.licence.clone(),
+        license: provenance.license.clone(),
         camera: provenance.camera.as_ref().map(camera_to_wire),
         keypoints: keypoints.transpose()?,
         ..pb::RoomUpload::default()

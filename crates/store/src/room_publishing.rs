@@ -562,8 +562,8 @@ impl Store {
         // object, so that comparing revisions by checksum still finds equal frames.
         let object = (columns(&frames) == columns(before)).then_some(body.frames);
         let mut provenance = room.provenance().clone();
-        if provenance.licence.is_empty() {
-            provenance.licence.clone_from(&known.provenance().licence);
+        if provenance.license.is_empty() {
+            provenance.license.clone_from(&known.provenance().license);
         }
 
         provenance.camera = provenance.camera.or(known.provenance().camera);

@@ -37,7 +37,7 @@ impl Swing {
     }
 }
 
-/// `frame_count` poses in the middle of a scene, `world_from_camera`, metres, at about 30 frames
+/// `frame_count` poses in the middle of a scene, `world_from_camera`, meters, at about 30 frames
 /// per second.
 pub fn camera_path(scene: &Scene, frame_count: usize, seed: u64) -> Vec<Pose> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
@@ -47,7 +47,7 @@ pub fn camera_path(scene: &Scene, frame_count: usize, seed: u64) -> Vec<Pose> {
     random.set_stream(1);
     let size = scene.size();
 
-    // Amplitudes are in metres or radians, periods in frames. Every period varies by up to 8 %,
+    // Amplitudes are in meters or radians, periods in frames. Every period varies by up to 8 %,
     // independently of the others.
     let mut swing = |amplitude: f64, period: f64| {
         let period = period * random.random_range(0.92..1.08);
@@ -81,7 +81,7 @@ pub fn camera_path(scene: &Scene, frame_count: usize, seed: u64) -> Vec<Pose> {
         .collect()
 }
 
-/// A path that circles in the middle of a room of `size`, metres, and looks about; it comes near
+/// A path that circles in the middle of a room of `size`, meters, and looks about; it comes near
 /// each position several times.
 pub(super) fn around(size: Vector3<f64>, frame_count: usize, random: &mut ChaCha8Rng) -> Vec<Pose> {
     let mut swing = |amplitude: f64, period: f64| {
@@ -119,7 +119,7 @@ pub(super) fn around(size: Vector3<f64>, frame_count: usize, random: &mut ChaCha
     (0..frame_count).map(pose).collect()
 }
 
-/// A straight path on the floor that is walked once, metres.
+/// A straight path on the floor that is walked once, meters.
 pub(super) struct Way {
     pub from: Vector3<f64>,
     pub to: Vector3<f64>,
@@ -156,7 +156,7 @@ pub(super) fn along(way: &Way, frame_count: usize, random: &mut ChaCha8Rng) -> V
         let mut at = way.from + ahead * part + aside * side.at(t);
         at.z = level + height.at(t);
 
-        // The sweep is centred: halfway along, the camera looks ahead, apart from the yaw
+        // The sweep is centered: halfway along, the camera looks ahead, apart from the yaw
         // oscillation.
         let turned = heading + way.sweep * (part - 0.5) + yaw.at(t);
         posed(at, looking(turned, -0.1 + pitch.at(t), roll.at(t)))

@@ -18,17 +18,17 @@ struct Sphere {
 }
 
 impl Spheres {
-    /// The bounding spheres as seen from `apex`, each enlarged by `margin`, metres.
+    /// The bounding spheres as seen from `apex`, each enlarged by `margin`, meters.
     pub fn around(apex: Point3<f64>, solids: &[Solid], margin: f64) -> Self {
         let seen = solids
             .iter()
             .map(|solid| {
-                let to_centre = solid.centre - apex;
-                let distance = to_centre.norm();
+                let to_center = solid.center - apex;
+                let distance = to_center.norm();
                 let sine = (solid.half.norm() + margin) / distance;
 
                 Sphere {
-                    direction: to_centre / distance,
+                    direction: to_center / distance,
                     edge: (sine < 1.0).then(|| (sine, (1.0 - sine * sine).sqrt())),
                 }
             })
@@ -76,7 +76,7 @@ pub(super) struct Shade {
 
 impl Shade {
     /// Builds the index for a lamp at `lamp`. Shadow rays may miss the lamp by up to `margin`,
-    /// metres.
+    /// meters.
     pub fn new(lamp: Point3<f64>, solids: &[Solid], margin: f64) -> Self {
         let spheres = Spheres::around(lamp, solids, margin);
         let cells = (0..6 * CELLS * CELLS)

@@ -41,7 +41,7 @@ pub struct Film {
     pub kind: &'static str,
     /// Horizontal field of view of the camera, radians; its pixels are square.
     pub field_of_view_rad: f64,
-    /// `world_from_camera`, metres, at 30 frames per second.
+    /// `world_from_camera`, meters, at 30 frames per second.
     pub poses: Vec<Pose>,
     /// The room during each visit.
     pub(super) scenes: Vec<Scene>,
@@ -67,7 +67,7 @@ pub(super) struct Visit {
 pub(super) struct PasserBy {
     /// The body at the start of the line.
     pub body: Vec<Solid>,
-    /// Displacement per frame, metres.
+    /// Displacement per frame, meters.
     pub step: nalgebra::Vector3<f64>,
     /// The frames during which the person is in the room.
     pub frames: std::ops::Range<usize>,
@@ -227,7 +227,7 @@ impl PasserBy {
         self.body
             .iter()
             .map(|solid| Solid {
-                centre: solid.centre + way,
+                center: solid.center + way,
                 ..*solid
             })
             .collect()

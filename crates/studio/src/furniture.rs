@@ -1,6 +1,6 @@
 //! Furniture: pieces along the walls, and a table with chairs in the middle of the room.
 //!
-//! A piece has its own coordinates, metres: x along its width, centered; y from the wall into the
+//! A piece has its own coordinates, meters: x along its width, centered; y from the wall into the
 //! room; z up.
 
 use nalgebra::{Point3, Vector3};
@@ -8,12 +8,12 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
 use super::solid::Solid;
-use super::texture::{Colour, Material};
+use super::texture::{Color, Material};
 
 /// A box of a piece: low corner, high corner, material.
 type Block = ([f64; 3], [f64; 3], Material);
 
-/// Furnishes a room of `size`, metres.
+/// Furnishes a room of `size`, meters.
 pub(super) fn furnish(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Solid> {
     let mut solids = Vec::new();
     let quarter = std::f64::consts::FRAC_PI_2;
@@ -37,17 +37,17 @@ pub(super) fn furnish(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Solid>
         }
     }
 
-    let centre = [size.x * 0.5, size.y * 0.5];
+    let center = [size.x * 0.5, size.y * 0.5];
     let turn = random.random_range(-0.4..0.4);
     let blocks = table(random);
-    solids.extend(placed(&blocks, centre, turn, random));
+    solids.extend(placed(&blocks, center, turn, random));
 
     // Three chairs stand around the table, about 120° apart.
     for side in 0..3 {
         let angle = turn + f64::from(side) * 2.1 + random.random_range(-0.3..0.3);
         let at = [
-            centre[0] + 0.85 * angle.cos(),
-            centre[1] + 0.75 * angle.sin(),
+            center[0] + 0.85 * angle.cos(),
+            center[1] + 0.75 * angle.sin(),
         ];
         let blocks = chair(random);
         solids.extend(placed(&blocks, at, angle + quarter, random));
@@ -56,7 +56,7 @@ pub(super) fn furnish(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Solid>
     solids
 }
 
-/// Furnishes a room of `size`, metres, with a random number of pieces along each wall, and in most
+/// Furnishes a room of `size`, meters, with a random number of pieces along each wall, and in most
 /// rooms with a table and chairs.
 pub(super) fn furnish_loosely(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Solid> {
     let mut solids = Vec::new();
@@ -86,21 +86,21 @@ pub(super) fn furnish_loosely(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Ve
     }
 
     if random.random_bool(0.7) {
-        let centre = [
+        let center = [
             size.x * random.random_range(0.42..0.58),
             size.y * random.random_range(0.42..0.58),
         ];
 
         let turn = random.random_range(-0.6..0.6);
         let blocks = table(random);
-        solids.extend(placed(&blocks, centre, turn, random));
+        solids.extend(placed(&blocks, center, turn, random));
 
         // One to four chairs stand around the table, about 90° apart.
         for side in 0..random.random_range(1..5) {
             let angle = turn + f64::from(side) * 1.6 + random.random_range(-0.3..0.3);
             let at = [
-                centre[0] + 0.85 * angle.cos(),
-                centre[1] + 0.75 * angle.sin(),
+                center[0] + 0.85 * angle.cos(),
+                center[1] + 0.75 * angle.sin(),
             ];
             let blocks = chair(random);
             solids.extend(placed(&blocks, at, angle + quarter, random));
@@ -110,7 +110,7 @@ pub(super) fn furnish_loosely(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Ve
     solids
 }
 
-/// Furnishes a corridor along x, of `size`, metres, with shallow pieces on its long sides.
+/// Furnishes a corridor along x, of `size`, meters, with shallow pieces on its long sides.
 pub(super) fn furnish_corridor(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Solid> {
     let mut solids = Vec::new();
     let mut along = random.random_range(0.9..1.8);
@@ -149,12 +149,12 @@ fn wall_piece(random: &mut ChaCha8Rng) -> Vec<Block> {
     }
 }
 
-fn hue(random: &mut ChaCha8Rng, saturation: f64, value: f64) -> Colour {
-    Colour::of_hue(random.random_range(0.0..1.0), saturation, value)
+fn hue(random: &mut ChaCha8Rng, saturation: f64, value: f64) -> Color {
+    Color::of_hue(random.random_range(0.0..1.0), saturation, value)
 }
 
 fn timber(random: &mut ChaCha8Rng) -> Material {
-    Material::Wood(Colour::of_hue(
+    Material::Wood(Color::of_hue(
         random.random_range(0.04..0.11),
         0.6,
         random.random_range(0.25..0.6),
@@ -213,19 +213,19 @@ fn bed(random: &mut ChaCha8Rng) -> Vec<Block> {
         (
             [-0.72, 0.05, 0.28],
             [0.72, 1.9, 0.45],
-            Material::Plain(Colour::WHITE),
+            Material::Plain(Color::WHITE),
         ),
         ([-0.74, 0.7, 0.3], [0.74, 1.93, 0.5], blanket),
         ([-0.78, 0.0, 0.0], [0.78, 0.06, 1.0], wood),
         (
             [-0.6, 0.1, 0.45],
             [-0.1, 0.5, 0.58],
-            Material::Plain(Colour::WHITE),
+            Material::Plain(Color::WHITE),
         ),
         (
             [0.1, 0.1, 0.45],
             [0.6, 0.5, 0.58],
-            Material::Plain(Colour::WHITE),
+            Material::Plain(Color::WHITE),
         ),
     ]
 }
@@ -251,7 +251,7 @@ fn desk(random: &mut ChaCha8Rng) -> Vec<Block> {
         (
             [screen - 0.05, 0.12, 0.74],
             [screen + 0.05, 0.2, 0.86],
-            Material::Plain(Colour([0.1, 0.1, 0.1])),
+            Material::Plain(Color([0.1, 0.1, 0.1])),
         ),
         (
             [0.45, 0.2, 0.74],
@@ -265,7 +265,7 @@ fn wardrobe(random: &mut ChaCha8Rng) -> Vec<Block> {
     let half = random.random_range(0.5..0.8);
     let high = random.random_range(1.8..2.15);
 
-    let colour = Colour::of_hue(
+    let color = Color::of_hue(
         random.random_range(0.03..0.15),
         0.35,
         random.random_range(0.4..0.8),
@@ -274,7 +274,7 @@ fn wardrobe(random: &mut ChaCha8Rng) -> Vec<Block> {
     vec![(
         [-half, 0.0, 0.0],
         [half, 0.58, high],
-        Material::Doors(colour),
+        Material::Doors(color),
     )]
 }
 
@@ -285,7 +285,7 @@ fn sideboard(random: &mut ChaCha8Rng) -> Vec<Block> {
         Material::Doors(hue(random, 0.3, 0.65)),
     )];
 
-    // Objects of random size and colour stand on top.
+    // Objects of random size and color stand on top.
     for item in 0..4 {
         let x = -0.55 + 0.33 * f64::from(item) + random.random_range(-0.05..0.05);
         let half = random.random_range(0.04..0.1);
@@ -312,7 +312,7 @@ fn plant(random: &mut ChaCha8Rng) -> Vec<Block> {
         let z = random.random_range(0.45..1.4);
         let half = random.random_range(0.07..0.16);
 
-        let green = Material::Leaves(Colour::of_hue(random.random_range(0.25..0.4), 0.65, 0.5));
+        let green = Material::Leaves(Color::of_hue(random.random_range(0.25..0.4), 0.65, 0.5));
         blocks.push((
             [x - half, y - half, z - half],
             [x + half, y + half, z + half],
@@ -323,7 +323,7 @@ fn plant(random: &mut ChaCha8Rng) -> Vec<Block> {
     blocks.push((
         [-0.02, 0.27, 0.3],
         [0.02, 0.31, 1.3],
-        Material::Plain(Colour([0.25, 0.16, 0.1])),
+        Material::Plain(Color([0.25, 0.16, 0.1])),
     ));
 
     blocks
@@ -341,7 +341,7 @@ fn table(random: &mut ChaCha8Rng) -> Vec<Block> {
         leg(0.54, 0.36),
     ]);
 
-    // Objects of random size and colour stand on top.
+    // Objects of random size and color stand on top.
     for item in 0..3 {
         let x = -0.4 + 0.4 * f64::from(item);
         let y = random.random_range(-0.25..0.25);
@@ -375,7 +375,7 @@ fn chair(random: &mut ChaCha8Rng) -> Vec<Block> {
 }
 
 /// Small objects on horizontal furniture tops, and larger ones on the floor along the walls of a
-/// room of `size`, metres.
+/// room of `size`, meters.
 pub(super) fn things(
     furniture: &[Solid],
     size: Vector3<f64>,
@@ -389,7 +389,7 @@ pub(super) fn things(
         .iter()
         .filter(|solid| solid.half.xy().min() > 0.14)
     {
-        let height = top.centre.z + top.half.z;
+        let height = top.center.z + top.half.z;
         if !(0.35..=1.95).contains(&height) {
             continue;
         }
@@ -413,7 +413,7 @@ pub(super) fn things(
                 off.z,
             );
 
-            things.push(thing(top.centre + turned, half, random));
+            things.push(thing(top.center + turned, half, random));
         }
     }
 
@@ -435,7 +435,7 @@ pub(super) fn things(
 }
 
 /// A box with random material and rotation.
-fn thing(centre: Point3<f64>, half: Vector3<f64>, random: &mut ChaCha8Rng) -> Solid {
+fn thing(center: Point3<f64>, half: Vector3<f64>, random: &mut ChaCha8Rng) -> Solid {
     let (sin, cos) = random.random_range(-1.5f64..1.5).sin_cos();
     let strength = random.random_range(0.2..0.8);
     let material = match random.random_range(0..7) {
@@ -443,12 +443,12 @@ fn thing(centre: Point3<f64>, half: Vector3<f64>, random: &mut ChaCha8Rng) -> So
         1 => cloth(random),
         2 => timber(random),
         3 => Material::Plain(hue(random, strength, 0.6)),
-        4 => Material::Plain(Colour::WHITE.scaled(strength)),
+        4 => Material::Plain(Color::WHITE.scaled(strength)),
         _ => Material::Printed(hue(random, 0.4, 0.75), hue(random, 0.7, 0.3)),
     };
 
     Solid {
-        centre,
+        center,
         half,
         cos,
         sin,
@@ -457,7 +457,7 @@ fn thing(centre: Point3<f64>, half: Vector3<f64>, random: &mut ChaCha8Rng) -> So
     }
 }
 
-/// The boxes of a piece at position `at` on the floor, metres, rotated about the vertical axis by
+/// The boxes of a piece at position `at` on the floor, meters, rotated about the vertical axis by
 /// `turn`, radians.
 fn placed<'a>(
     blocks: &'a [Block],
@@ -474,14 +474,14 @@ fn placed<'a>(
         let half = (high - low) / 2.0;
 
         // Transform from piece to room coordinates.
-        let centre = Point3::new(
+        let center = Point3::new(
             at[0] + cos * middle.x - sin * middle.y,
             at[1] + sin * middle.x + cos * middle.y,
             middle.z,
         );
 
         Solid {
-            centre,
+            center,
             half,
             cos,
             sin,

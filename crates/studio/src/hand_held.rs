@@ -17,9 +17,9 @@ use seese3_core::statistics::normal_deviates;
 /// Distribution of standpoints and views, and speeds.
 #[derive(Debug, Clone)]
 pub(super) struct Habit {
-    /// Center of the standpoints, metres.
+    /// Center of the standpoints, meters.
     pub middle: Vector3<f64>,
-    /// Maximum offset of a standpoint from the center along each axis, metres.
+    /// Maximum offset of a standpoint from the center along each axis, meters.
     pub reach: Vector3<f64>,
     /// Center of the views, as yaw and pitch, radians.
     pub view: [f64; 2],
@@ -27,7 +27,7 @@ pub(super) struct Habit {
     pub view_reach: [f64; 2],
     /// Standard deviation of the roll, radians.
     pub roll: f64,
-    /// Mean translation speed of a stroke, metres per second.
+    /// Mean translation speed of a stroke, meters per second.
     pub speed: f64,
     /// Mean rotation speed of a stroke, radians per second.
     pub turning: f64,
@@ -43,7 +43,7 @@ pub(super) struct Goals {
     views: Vec<SVector<f64, 2>>,
 }
 
-/// Standard deviations of the offset when a standpoint, metres, or a view, radians, is revisited.
+/// Standard deviations of the offset when a standpoint, meters, or a view, radians, is revisited.
 const MISS: [f64; 2] = [0.06, 0.06];
 
 impl Goals {
@@ -109,7 +109,7 @@ impl Goals {
 /// A path of the hand without its tremor, one entry per frame.
 #[derive(Debug, Clone)]
 pub(super) struct HandPath {
-    /// Metres.
+    /// Meters.
     positions: Vec<SVector<f64, 3>>,
     /// Yaw and pitch, radians.
     views: Vec<SVector<f64, 2>>,
@@ -123,9 +123,9 @@ impl HandPath {
         self.positions.is_empty()
     }
 
-    /// The poses with the tremor of the hand, `world_from_camera`, metres.
+    /// The poses with the tremor of the hand, `world_from_camera`, meters.
     pub fn poses(&self, random: &mut ChaCha8Rng) -> Vec<Pose> {
-        // Position in metres, then yaw, pitch and roll in radians.
+        // Position in meters, then yaw, pitch and roll in radians.
         let tremor: [Tremor; 6] =
             std::array::from_fn(|axis| Tremor::new(if axis < 3 { 0.005 } else { 0.006 }, random));
 
@@ -143,7 +143,7 @@ impl HandPath {
 
     /// A later visit that follows this path for the most part: at other speeds, in stretches
     /// forward and backward, beside it and with other views. Positions stay between the corners
-    /// `bounds`, metres. This path must not be empty.
+    /// `bounds`, meters. This path must not be empty.
     pub fn followed(
         &self,
         frame_count: usize,
@@ -189,7 +189,7 @@ impl HandPath {
     }
 }
 
-/// Largest offset from a followed path, metres, and the largest one where the path is left.
+/// Largest offset from a followed path, meters, and the largest one where the path is left.
 const NEAR_M: f64 = 0.3;
 const FAR_M: f64 = 0.8;
 /// Standard deviation of the difference of views along a followed path, radians.
@@ -198,7 +198,7 @@ const TURN_RAD: f64 = 0.1;
 const ELSEWHERE_RAD: [f64; 2] = [0.4, 1.2];
 /// Share of the offsets, and of the views, that leave the followed path.
 const ASIDE: f64 = 0.2;
-/// Mean speeds at which offset and view change: metres and radians per second.
+/// Mean speeds at which offset and view change: meters and radians per second.
 const BESIDE_SPEED: f64 = 0.15;
 const TURN_SPEED: f64 = 0.3;
 /// Range of the speed along a followed path, in speeds of the first visit.

@@ -1,7 +1,7 @@
 //! The studio: procedural rooms, rendered by ray casting. They provide images with exact poses
 //! without a data set.
 //!
-//! - World axes: x and y along the floor, z up, metres. The floor is z = 0, and one corner of the
+//! - World axes: x and y along the floor, z up, meters. The floor is z = 0, and one corner of the
 //!   room is at (0, 0).
 //! - Everything is deterministic for a seed. The camera is a pinhole with square pixels.
 //!
@@ -41,7 +41,7 @@ use rand_chacha::ChaCha8Rng;
 
 use candidates::Shade;
 use solid::Solid;
-use texture::Colour;
+use texture::Color;
 
 /// Frame rate of a recording, frames per second.
 const FRAMES_PER_SECOND: f64 = 30.0;
@@ -49,7 +49,7 @@ const FRAMES_PER_SECOND: f64 = 30.0;
 /// A furnished room.
 #[derive(Debug, Clone)]
 pub struct Scene {
-    /// Width (x), depth (y) and height (z), metres.
+    /// Width (x), depth (y) and height (z), meters.
     size: Vector3<f64>,
     shell: Shell,
     solids: Vec<Solid>,
@@ -64,7 +64,7 @@ pub struct Scene {
 /// Lighting of a room.
 #[derive(Debug, Clone, Copy)]
 struct Light {
-    /// Brightness of the lamp on a surface that faces it at about one metre.
+    /// Brightness of the lamp on a surface that faces it at about one meter.
     lamp: f64,
     /// Tint of the lamp: factors of red, green and blue.
     lamp_tint: [f64; 3],
@@ -93,22 +93,22 @@ impl Light {
 #[derive(Debug, Clone)]
 struct Shell {
     seed: u32,
-    wall_colours: [Colour; 4],
+    wall_colors: [Color; 4],
     wallpaper: Wallpaper,
     floor: Floor,
-    /// Rectangles on each wall, in wall coordinates (along, up), metres.
+    /// Rectangles on each wall, in wall coordinates (along, up), meters.
     panels: [Vec<Panel>; 4],
     rug: Rug,
 }
 
 #[derive(Debug, Clone, Copy)]
 enum Floor {
-    Planks(Colour),
-    Tiles(Colour),
-    Carpet(Colour),
+    Planks(Color),
+    Tiles(Color),
+    Carpet(Color),
 }
 
-/// Pattern of the walls; lengths in metres.
+/// Pattern of the walls; lengths in meters.
 #[derive(Debug, Clone, Copy)]
 enum Wallpaper {
     None,
@@ -141,7 +141,7 @@ enum PanelKind {
 struct Rug {
     low: [f64; 2],
     high: [f64; 2],
-    colours: [Colour; 2],
+    colors: [Color; 2],
 }
 
 impl Scene {
@@ -167,7 +167,7 @@ impl Scene {
         Self::lit_by(size, shell, solids, lamp, Light::PLAIN)
     }
 
-    /// A room of `size`, metres, with its lamp at `lamp`.
+    /// A room of `size`, meters, with its lamp at `lamp`.
     fn lit_by(
         size: Vector3<f64>,
         shell: Shell,
@@ -194,7 +194,7 @@ impl Scene {
         self.shade = Shade::new(self.lamp, &self.solids, light::LIFT_M);
     }
 
-    /// Width (x), depth (y) and height (z), metres.
+    /// Width (x), depth (y) and height (z), meters.
     pub fn size(&self) -> Vector3<f64> {
         self.size
     }
@@ -203,19 +203,19 @@ impl Scene {
 impl Shell {
     fn new(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Self {
         // One of the four walls has an accent color.
-        let base = Colour::of_hue(random.random_range(0.0..1.0), 0.22, 0.78);
-        let accent = Colour::of_hue(random.random_range(0.0..1.0), 0.45, 0.6);
+        let base = Color::of_hue(random.random_range(0.0..1.0), 0.22, 0.78);
+        let accent = Color::of_hue(random.random_range(0.0..1.0), 0.45, 0.6);
         let accent_wall = random.random_range(0..4);
-        let wall_colours =
+        let wall_colors =
             std::array::from_fn(|wall| if wall == accent_wall { accent } else { base });
 
-        let wood = Colour::of_hue(
+        let wood = Color::of_hue(
             random.random_range(0.05..0.1),
             0.55,
             random.random_range(0.35..0.6),
         );
 
-        let tile = Colour::of_hue(random.random_range(0.0..1.0), 0.15, 0.65);
+        let tile = Color::of_hue(random.random_range(0.0..1.0), 0.15, 0.65);
         let floor = if random.random_bool(0.6) {
             Floor::Planks(wood)
         } else {
@@ -242,21 +242,21 @@ impl Shell {
             wall_panels(length, feature, random)
         });
 
-        let centre = [size.x * 0.5, size.y * 0.5];
+        let center = [size.x * 0.5, size.y * 0.5];
         let half = [random.random_range(0.8..1.3), random.random_range(0.6..1.0)];
 
         let rug = Rug {
-            low: [centre[0] - half[0], centre[1] - half[1]],
-            high: [centre[0] + half[0], centre[1] + half[1]],
-            colours: [
-                Colour::of_hue(random.random_range(0.0..1.0), 0.6, 0.45),
-                Colour::of_hue(random.random_range(0.0..1.0), 0.3, 0.75),
+            low: [center[0] - half[0], center[1] - half[1]],
+            high: [center[0] + half[0], center[1] + half[1]],
+            colors: [
+                Color::of_hue(random.random_range(0.0..1.0), 0.6, 0.45),
+                Color::of_hue(random.random_range(0.0..1.0), 0.3, 0.75),
             ],
         };
 
         Self {
             seed: random.random(),
-            wall_colours,
+            wall_colors,
             wallpaper: Wallpaper::None,
             floor,
             panels,
@@ -268,13 +268,13 @@ impl Shell {
 impl Shell {
     /// Desaturates the walls: a `share` of 0 gives gray, 1 changes nothing.
     fn fade(&mut self, share: f64) {
-        for colour in &mut self.wall_colours {
-            let grey = colour.0.iter().sum::<f64>() / 3.0;
-            *colour = Colour([grey; 3]).mixed(*colour, share);
+        for color in &mut self.wall_colors {
+            let grey = color.0.iter().sum::<f64>() / 3.0;
+            *color = Color([grey; 3]).mixed(*color, share);
         }
     }
 
-    /// Adds notes and prints to the walls, at most three per metre.
+    /// Adds notes and prints to the walls, at most three per meter.
     fn pin_up(&mut self, size: Vector3<f64>, random: &mut ChaCha8Rng) {
         for (wall, panels) in self.panels.iter_mut().enumerate() {
             let length = if wall.is_multiple_of(2) {

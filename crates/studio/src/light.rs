@@ -5,16 +5,16 @@ use nalgebra::{Point3, Vector3};
 
 use super::Scene;
 use super::solid::{Place, Ray, Solid, Surface};
-use super::texture::{Colour, detail};
+use super::texture::{Color, detail};
 
-/// Offset of a shadow ray's origin from its surface, metres, which prevents self-shadowing.
+/// Offset of a shadow ray's origin from its surface, meters, which prevents self-shadowing.
 pub(super) const LIFT_M: f64 = 1e-3;
 
 /// The light and distance at the end of a ray.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct LitPoint {
     pub light: [f64; 3],
-    /// Distance from the ray's origin, metres.
+    /// Distance from the ray's origin, meters.
     pub distance: f64,
 }
 
@@ -47,8 +47,8 @@ impl Scene {
         if self.detail > 0.0 && surface.glow == 0.0 {
             let Place { u, v, seed } = surface.place;
             let finest = surface.distance * spread;
-            surface.colour = surface
-                .colour
+            surface.color = surface
+                .color
                 .scaled(detail(u, v, finest, self.detail, seed));
         }
 
@@ -110,7 +110,7 @@ impl Scene {
         let ambient = sky * (corner / 0.65).min(1.0);
 
         std::array::from_fn(|c| {
-            surface.colour.0[c] * (ambient + lamp * light.lamp_tint[c] + window + surface.glow)
+            surface.color.0[c] * (ambient + lamp * light.lamp_tint[c] + window + surface.glow)
         })
     }
 
@@ -156,16 +156,16 @@ impl Scene {
         // Axis and direction identify the plane. The coordinate along each wall runs
         // counterclockwise, seen from above, like the wall numbers.
         let on_wall = |wall: u32, along: f64| {
-            let (colour, glow) = self.wall_colour(wall as usize, along, at.z);
-            (colour, glow, along, at.z, wall)
+            let (color, glow) = self.wall_color(wall as usize, along, at.z);
+            (color, glow, along, at.z, wall)
         };
 
-        let (colour, glow, u, v, plane): (Colour, f64, f64, f64, u32) =
+        let (color, glow, u, v, plane): (Color, f64, f64, f64, u32) =
             match (axis, ray.direction[axis] > 0.0) {
-                (2, false) => (self.floor_colour(at.x, at.y), 0.0, at.x, at.y, 4),
+                (2, false) => (self.floor_color(at.x, at.y), 0.0, at.x, at.y, 4),
                 (2, true) => {
-                    let (colour, glow) = self.ceiling_colour(at.x, at.y);
-                    (colour, glow, at.x, at.y, 5)
+                    let (color, glow) = self.ceiling_color(at.x, at.y);
+                    (color, glow, at.x, at.y, 5)
                 }
                 (1, false) => on_wall(0, at.x),
                 (0, true) => on_wall(1, at.y),
@@ -176,7 +176,7 @@ impl Scene {
         Surface {
             distance,
             normal,
-            colour,
+            color,
             glow,
             place: Place {
                 u,

@@ -9,7 +9,7 @@ use seese3_core::image::RgbImage;
 /// Camera settings of one photograph.
 #[derive(Debug, Clone)]
 pub(super) struct Shot {
-    /// Camera motion while the shutter is open: the end pose in the start pose's frame, metres.
+    /// Camera motion while the shutter is open: the end pose in the start pose's frame, meters.
     pub motion: Isometry3<f64>,
     /// Exposure factor, in addition to the automatic exposure.
     pub exposure: f64,
@@ -202,7 +202,7 @@ mod tests {
         }
     }
 
-    /// A white column of pixels on black; all pixels are `distance` metres away.
+    /// A white column of pixels on black; all pixels are `distance` meters away.
     fn stripe(distance: f32) -> Radiance {
         let light = (0..40 * 30)
             .map(|at| if at % 40 == 20 { [1.0; 3] } else { [0.0; 3] })
@@ -222,8 +222,8 @@ mod tests {
     #[test]
     fn what_is_near_blurs_more() {
         let motion = Isometry3::translation(0.3, 0.0, 0.0);
-        let smeared = |metres: f32| {
-            let radiance = stripe(metres);
+        let smeared = |meters: f32| {
+            let radiance = stripe(meters);
             let blur = Blur::new(&radiance, camera(), motion);
             (0..40)
                 .filter(|&column| blur.light(column, 15)[0] > 0.0)

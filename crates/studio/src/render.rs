@@ -89,7 +89,7 @@ pub(super) struct Radiance {
     pub height: usize,
     /// Linear light in red, green and blue, row by row; 1 is white in a plain image.
     pub light: Vec<[f64; 3]>,
-    /// Distance from the camera's center, metres, row by row.
+    /// Distance from the camera's center, meters, row by row.
     pub distance: Vec<f32>,
 }
 

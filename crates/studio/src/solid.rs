@@ -2,13 +2,13 @@
 
 use nalgebra::{Point3, Vector3};
 
-use super::texture::{Colour, Material};
+use super::texture::{Color, Material};
 
 /// A box, rotated about the vertical axis.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Solid {
-    pub centre: Point3<f64>,
-    /// Half of the length of each side, metres.
+    pub center: Point3<f64>,
+    /// Half of the length of each side, meters.
     pub half: Vector3<f64>,
     /// Cosine and sine of the rotation.
     pub cos: f64,
@@ -25,17 +25,17 @@ pub(super) struct Ray {
 
 /// The surface point at the end of a ray.
 pub(super) struct Surface {
-    /// Distance from the ray's origin, metres.
+    /// Distance from the ray's origin, meters.
     pub distance: f64,
     pub normal: Vector3<f64>,
-    pub colour: Colour,
+    pub color: Color,
     /// Emitted light, as a factor of the color; nonzero for windows and the lamp's panel.
     pub glow: f64,
-    /// Coordinates on the surface, metres, and the seed of its texture.
+    /// Coordinates on the surface, meters, and the seed of its texture.
     pub place: Place,
 }
 
-/// A place on a surface: coordinates in metres, and the seed of the surface's texture.
+/// A place on a surface: coordinates in meters, and the seed of the surface's texture.
 pub(super) struct Place {
     pub u: f64,
     pub v: f64,
@@ -52,9 +52,9 @@ impl Solid {
         )
     }
 
-    /// The point where a ray enters the box, if within `limit`, metres.
+    /// The point where a ray enters the box, if within `limit`, meters.
     pub fn touch(&self, ray: &Ray, limit: f64) -> Option<Touch<'_>> {
-        let origin = self.turned_back(ray.origin - self.centre);
+        let origin = self.turned_back(ray.origin - self.center);
         let direction = self.turned_back(ray.direction);
         let mut enter = f64::NEG_INFINITY;
         let mut leave = f64::INFINITY;
@@ -93,7 +93,7 @@ impl Solid {
 /// The point where a ray enters a box; origin and direction are in box coordinates.
 pub(super) struct Touch<'a> {
     solid: &'a Solid,
-    /// Distance from the ray's origin, metres.
+    /// Distance from the ray's origin, meters.
     pub distance: f64,
     axis: usize,
     origin: Vector3<f64>,
@@ -124,7 +124,7 @@ impl Touch<'_> {
 
         // Heights start at the bottom of the box, so that rows of books and boards align.
         let v = if axis == 2 { v } else { v + solid.half.z };
-        let colour = solid.material.colour(u, v, front, solid.seed);
+        let color = solid.material.color(u, v, front, solid.seed);
 
         // Rotate the normal back to world coordinates.
         let normal = Vector3::new(
@@ -136,7 +136,7 @@ impl Touch<'_> {
         Surface {
             distance,
             normal,
-            colour,
+            color,
             glow: 0.0,
             place: Place {
                 u,

@@ -11,7 +11,7 @@ use rand_chacha::ChaCha8Rng;
 use strum::IntoStaticStr;
 
 use super::camera_path::{Way, along, around};
-use super::texture::Colour;
+use super::texture::Color;
 use super::{Floor, Light, Scene, Shell, Wallpaper, furniture};
 use seese3_core::geometry::Pose;
 
@@ -86,7 +86,7 @@ impl SuiteRoom {
         }
     }
 
-    /// `frame_count` poses, `world_from_camera`, metres, at about 30 frames per second.
+    /// `frame_count` poses, `world_from_camera`, meters, at about 30 frames per second.
     pub fn path(&self, frame_count: usize) -> Vec<Pose> {
         let mut random = ChaCha8Rng::seed_from_u64(self.seed);
         let size = self.scene.size;
@@ -135,7 +135,7 @@ impl SuiteRoom {
     }
 }
 
-/// Width (x), depth (y) and height (z), metres.
+/// Width (x), depth (y) and height (z), meters.
 pub(super) fn room_size(walk: Walk, random: &mut ChaCha8Rng) -> Vector3<f64> {
     let height = random.random_range(2.4..3.1);
     if walk == Walk::Corridor {
@@ -161,7 +161,7 @@ pub(super) fn room_size(walk: Walk, random: &mut ChaCha8Rng) -> Vector3<f64> {
 /// rooms without a rug.
 pub(super) fn decorate(shell: &mut Shell, walk: Walk, size: Vector3<f64>, random: &mut ChaCha8Rng) {
     if random.random_bool(0.3) {
-        shell.floor = Floor::Carpet(Colour::of_hue(
+        shell.floor = Floor::Carpet(Color::of_hue(
             random.random_range(0.0..1.0),
             0.35,
             random.random_range(0.3..0.6),
@@ -208,7 +208,7 @@ mod tests {
                 }
 
                 for solid in &room.scene.solids {
-                    let v = at - solid.centre;
+                    let v = at - solid.center;
                     let turned = [
                         solid.cos * v.x + solid.sin * v.y,
                         solid.cos * v.y - solid.sin * v.x,
@@ -227,7 +227,7 @@ mod tests {
     }
 
     /// Oracle: the definitions. A revisited room brings the camera back near an early place long
-    /// after, again and again; the others do not, and a calm hand moves at most a few centimetres
+    /// after, again and again; the others do not, and a calm hand moves at most a few centimeters
     /// and degrees from frame to frame.
     #[test]
     fn walks_are_what_they_are_called() {

@@ -1,10 +1,10 @@
-//! Colors of floor, ceiling and walls, by position in metres.
+//! Colors of floor, ceiling and walls, by position in meters.
 
-use super::texture::{Colour, fractal, hash2, noise, note, picture, wood};
+use super::texture::{Color, fractal, hash2, noise, note, picture, wood};
 use super::{Floor, Panel, PanelKind, Scene, Wallpaper};
 
 impl Scene {
-    pub(super) fn floor_colour(&self, x: f64, y: f64) -> Colour {
+    pub(super) fn floor_color(&self, x: f64, y: f64) -> Color {
         let shell = &self.shell;
         let rug = &self.shell.rug;
         if inside([x, y], rug.low, rug.high) {
@@ -18,14 +18,14 @@ impl Scene {
             let diamond = ((x * 4.0).rem_euclid(1.0) - 0.5).abs()
                 + ((y * 4.0).rem_euclid(1.0) - 0.5).abs()
                 < 0.32;
-            let colour = rug.colours[usize::from(border || diamond)];
+            let color = rug.colors[usize::from(border || diamond)];
 
-            return colour.scaled(0.8 + 0.2 * noise(x * 50.0, y * 50.0, shell.seed));
+            return color.scaled(0.8 + 0.2 * noise(x * 50.0, y * 50.0, shell.seed));
         }
 
         match shell.floor {
             // Planks are 14 cm wide and 1.1 m long; rows are shifted, so that joints do not align.
-            Floor::Planks(colour) => {
+            Floor::Planks(color) => {
                 let plank = (y / 0.14).floor();
                 let along = x + 0.9 * hash2(plank as i64, 1, shell.seed);
                 let tone =
@@ -34,15 +34,15 @@ impl Scene {
                 let seam =
                     (y / 0.14).rem_euclid(1.0) < 0.05 || (along / 1.1).rem_euclid(1.0) < 0.008;
 
-                wood(colour, along, y, shell.seed).scaled(if seam { 0.4 } else { tone })
+                wood(color, along, y, shell.seed).scaled(if seam { 0.4 } else { tone })
             }
-            Floor::Carpet(colour) => {
+            Floor::Carpet(color) => {
                 let weave = 0.8 + 0.2 * noise(x * 70.0, y * 70.0, shell.seed);
-                colour.scaled(weave * (0.85 + 0.3 * fractal(x * 1.5, y * 1.5, shell.seed ^ 3)))
+                color.scaled(weave * (0.85 + 0.3 * fractal(x * 1.5, y * 1.5, shell.seed ^ 3)))
             }
 
             // Tiles of 40 cm with individual tones, and gray joints.
-            Floor::Tiles(colour) => {
+            Floor::Tiles(color) => {
                 let i = (x / 0.4).floor();
                 let j = (y / 0.4).floor();
                 let grout = (x / 0.4).rem_euclid(1.0) < 0.03 || (y / 0.4).rem_euclid(1.0) < 0.03;
@@ -50,15 +50,15 @@ impl Scene {
 
                 let cloud = 0.85 + 0.3 * fractal(x * 3.0, y * 3.0, shell.seed);
                 if grout {
-                    Colour([0.25, 0.25, 0.25])
+                    Color([0.25, 0.25, 0.25])
                 } else {
-                    colour.scaled(tone * cloud)
+                    color.scaled(tone * cloud)
                 }
             }
         }
     }
 
-    pub(super) fn ceiling_colour(&self, x: f64, y: f64) -> (Colour, f64) {
+    pub(super) fn ceiling_color(&self, x: f64, y: f64) -> (Color, f64) {
         // Above the lamp is a panel of 60 by 60 cm that emits light.
         let lamp = inside(
             [x, y],
@@ -67,32 +67,32 @@ impl Scene {
         );
 
         let beam = (x / 1.3).rem_euclid(1.0) < 0.07;
-        let colour = Colour::WHITE.scaled(if beam { 0.7 } else { 0.95 });
+        let color = Color::WHITE.scaled(if beam { 0.7 } else { 0.95 });
 
-        (colour, if lamp { self.light.panel } else { 0.0 })
+        (color, if lamp { self.light.panel } else { 0.0 })
     }
 
-    pub(super) fn wall_colour(&self, wall: usize, along: f64, up: f64) -> (Colour, f64) {
+    pub(super) fn wall_color(&self, wall: usize, along: f64, up: f64) -> (Color, f64) {
         let shell = &self.shell;
 
         // From front to back: panels (door, window, pictures, notes), a skirting board of 10 cm,
         // the wall.
         let on = |panel: &&Panel| inside([along, up], panel.low, panel.high);
         if let Some(panel) = shell.panels[wall].iter().find(on) {
-            let (colour, glow) = panel_colour(panel, along, up);
-            return (colour, glow * self.light.daylight);
+            let (color, glow) = panel_color(panel, along, up);
+            return (color, glow * self.light.daylight);
         }
         if up < 0.1 {
-            return (Colour::WHITE.scaled(0.8), 0.0);
+            return (Color::WHITE.scaled(0.8), 0.0);
         }
 
         let plaster = 0.9 + 0.14 * fractal(along * 2.5, up * 2.5, shell.seed ^ wall as u32);
-        let colour = shell.wall_colours[wall].scaled(plaster);
+        let color = shell.wall_colors[wall].scaled(plaster);
 
         (
             shell
                 .wallpaper
-                .over(colour, along, up, shell.seed ^ wall as u32),
+                .over(color, along, up, shell.seed ^ wall as u32),
             0.0,
         )
     }
@@ -100,16 +100,16 @@ impl Scene {
 
 impl Wallpaper {
     /// The wall's color with this pattern.
-    fn over(self, colour: Colour, along: f64, up: f64, seed: u32) -> Colour {
+    fn over(self, color: Color, along: f64, up: f64, seed: u32) -> Color {
         match self {
-            Self::None => colour,
-            Self::Stripes(apart) if (along / apart).rem_euclid(1.0) < 0.5 => colour,
-            Self::Stripes(_) => colour.scaled(0.72),
-            Self::Boards(height) if up > height + 0.04 => colour,
-            Self::Boards(height) if up > height => Colour::WHITE.scaled(0.75),
+            Self::None => color,
+            Self::Stripes(apart) if (along / apart).rem_euclid(1.0) < 0.5 => color,
+            Self::Stripes(_) => color.scaled(0.72),
+            Self::Boards(height) if up > height + 0.04 => color,
+            Self::Boards(height) if up > height => Color::WHITE.scaled(0.75),
             Self::Boards(_) => {
                 let groove = (along / 0.12).rem_euclid(1.0) < 0.08;
-                Colour::WHITE.scaled(if groove { 0.45 } else { 0.7 })
+                Color::WHITE.scaled(if groove { 0.45 } else { 0.7 })
             }
 
             // Bricks of 22 by 8 cm; every second row is shifted by half a brick.
@@ -120,17 +120,17 @@ impl Wallpaper {
                 let tone = 0.65 + 0.5 * hash2(place.floor() as i64, course as i64, seed);
 
                 if mortar {
-                    Colour::WHITE.scaled(0.55)
+                    Color::WHITE.scaled(0.55)
                 } else {
-                    colour.mixed(Colour([0.45, 0.2, 0.13]), 0.6).scaled(tone)
+                    color.mixed(Color([0.45, 0.2, 0.13]), 0.6).scaled(tone)
                 }
             }
         }
     }
 }
 
-fn panel_colour(panel: &Panel, along: f64, up: f64) -> (Colour, f64) {
-    // (u, v) are coordinates on the panel, metres from its low corner.
+fn panel_color(panel: &Panel, along: f64, up: f64) -> (Color, f64) {
+    // (u, v) are coordinates on the panel, meters from its low corner.
     let u = along - panel.low[0];
     let v = up - panel.low[1];
 
@@ -147,12 +147,12 @@ fn panel_colour(panel: &Panel, along: f64, up: f64) -> (Colour, f64) {
 
     match panel.kind {
         PanelKind::Note => (note(u, v, panel.seed), 0.0),
-        PanelKind::Picture if framed => (Colour([0.12, 0.09, 0.06]), 0.0),
+        PanelKind::Picture if framed => (Color([0.12, 0.09, 0.06]), 0.0),
         PanelKind::Picture => (picture(u, v, panel.seed), 0.0),
         PanelKind::Window => {
             let middle = (panel.high[0] - panel.low[0]) / 2.0;
             if framed || (u - middle).abs() < 0.03 {
-                return (Colour::WHITE, 0.2);
+                return (Color::WHITE, 0.2);
             }
 
             // The view through the window: hills below a wavy line, and a sky that is paler toward
@@ -161,28 +161,28 @@ fn panel_colour(panel: &Panel, along: f64, up: f64) -> (Colour, f64) {
             let hills = 0.35 + 0.2 * fractal(u * 2.0, 0.0, panel.seed);
             if height < hills {
                 (
-                    Colour([0.2, 0.38, 0.15])
+                    Color([0.2, 0.38, 0.15])
                         .scaled(0.6 + 0.8 * noise(u * 9.0, v * 9.0, panel.seed)),
                     0.6,
                 )
             } else {
                 (
-                    Colour([0.55, 0.7, 0.9]).mixed(Colour([0.9, 0.93, 0.95]), 1.0 - height),
+                    Color([0.55, 0.7, 0.9]).mixed(Color([0.9, 0.93, 0.95]), 1.0 - height),
                     0.9,
                 )
             }
         }
-        PanelKind::Door if framed => (Colour::WHITE.scaled(0.75), 0.0),
+        PanelKind::Door if framed => (Color::WHITE.scaled(0.75), 0.0),
         PanelKind::Door => {
             // A door is 0.9 m wide, with a handle near one edge and two darker fields.
             let handle = (u - 0.75).abs() < 0.05 && (v - 1.0).abs() < 0.03;
             let fill =
                 (0.2..0.7).contains(&u) && ((0.25..0.9).contains(&v) || (1.1..1.8).contains(&v));
-            let timber = Colour::of_hue(0.07, 0.5, if fill { 0.38 } else { 0.5 });
+            let timber = Color::of_hue(0.07, 0.5, if fill { 0.38 } else { 0.5 });
 
             (
                 if handle {
-                    Colour([0.7, 0.65, 0.4])
+                    Color([0.7, 0.65, 0.4])
                 } else {
                     wood(timber, v, u, panel.seed)
                 },

@@ -1,10 +1,10 @@
-//! Procedural textures: colors from noise, by position on a surface in metres.
+//! Procedural textures: colors from noise, by position on a surface in meters.
 
 /// A color in linear light: red, green and blue, 0 to 1.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Colour(pub [f64; 3]);
+pub(super) struct Color(pub [f64; 3]);
 
-impl Colour {
+impl Color {
     pub const WHITE: Self = Self([0.85, 0.85, 0.83]);
 
     /// The color with a hue, a saturation and a value (HSV), 0 to 1 each; the hue wraps around.
@@ -30,34 +30,34 @@ impl Colour {
 /// The material of a box.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Material {
-    Plain(Colour),
-    Wood(Colour),
-    Fabric(Colour, Colour),
+    Plain(Color),
+    Wood(Color),
+    Fabric(Color, Color),
     Books,
-    Doors(Colour),
+    Doors(Color),
     Screen,
-    Leaves(Colour),
+    Leaves(Color),
     /// Printed cardboard: paper color and ink color.
-    Printed(Colour, Colour),
+    Printed(Color, Color),
 }
 
 impl Material {
-    /// Color at (u, v), metres, on a face. `front` is true for the face toward the room.
-    pub fn colour(self, u: f64, v: f64, front: bool, seed: u32) -> Colour {
+    /// Color at (u, v), meters, on a face. `front` is true for the face toward the room.
+    pub fn color(self, u: f64, v: f64, front: bool, seed: u32) -> Color {
         match self {
-            Self::Plain(colour) => colour.scaled(0.94 + 0.06 * noise(u * 8.0, v * 8.0, seed)),
-            Self::Wood(colour) => wood(colour, u, v, seed),
-            Self::Fabric(colour, stripe) => {
+            Self::Plain(color) => color.scaled(0.94 + 0.06 * noise(u * 8.0, v * 8.0, seed)),
+            Self::Wood(color) => wood(color, u, v, seed),
+            Self::Fabric(color, stripe) => {
                 let weave = 0.85 + 0.15 * noise(u * 60.0, v * 60.0, seed);
                 let striped = (u * 7.0 + unit(seed, 1)).rem_euclid(1.0) < 0.3;
 
-                colour
+                color
                     .mixed(stripe, if striped { 0.55 } else { 0.0 })
                     .scaled(weave)
             }
             Self::Books if front => books(u, v, seed),
-            Self::Books => wood(Colour([0.3, 0.2, 0.12]), u, v, seed),
-            Self::Doors(colour) => {
+            Self::Books => wood(Color([0.3, 0.2, 0.12]), u, v, seed),
+            Self::Doors(color) => {
                 // Doors are 50 cm wide, with dark seams between them and a handle near one edge;
                 // seams and handles only on the front.
                 let gap = (u / 0.5).rem_euclid(1.0);
@@ -66,9 +66,9 @@ impl Material {
                 let shade = if seam { 0.35 } else { 1.0 };
 
                 if handle {
-                    Colour([0.6, 0.6, 0.62])
+                    Color([0.6, 0.6, 0.62])
                 } else {
-                    wood(colour, v, u, seed).scaled(shade)
+                    wood(color, v, u, seed).scaled(shade)
                 }
             }
             Self::Screen if front => {
@@ -77,26 +77,26 @@ impl Material {
                 let lit = (u * 14.0).rem_euclid(7.0) < 1.0 + 5.0 * line
                     && (v * 40.0).rem_euclid(1.0) < 0.55;
                 if lit {
-                    Colour([0.55, 0.75, 0.8])
+                    Color([0.55, 0.75, 0.8])
                 } else {
-                    Colour([0.05, 0.07, 0.12])
+                    Color([0.05, 0.07, 0.12])
                 }
             }
-            Self::Screen => Colour([0.06, 0.06, 0.06]),
-            Self::Leaves(colour) => colour.scaled(0.45 + 0.75 * fractal(u * 14.0, v * 14.0, seed)),
+            Self::Screen => Color([0.06, 0.06, 0.06]),
+            Self::Leaves(color) => color.scaled(0.45 + 0.75 * fractal(u * 14.0, v * 14.0, seed)),
             Self::Printed(paper, ink) => printed(paper, ink, u, v, seed),
         }
     }
 }
 
 /// Wood with its grain along u.
-pub(super) fn wood(colour: Colour, u: f64, v: f64, seed: u32) -> Colour {
+pub(super) fn wood(color: Color, u: f64, v: f64, seed: u32) -> Color {
     let ring = fractal(u * 1.6, v * 22.0, seed);
-    colour.scaled(0.7 + 0.5 * ring)
+    color.scaled(0.7 + 0.5 * ring)
 }
 
 /// Rows of book spines between boards 0.33 m apart.
-fn books(u: f64, v: f64, seed: u32) -> Colour {
+fn books(u: f64, v: f64, seed: u32) -> Color {
     let row = (v / 0.33).floor() as i64;
     let height = (v / 0.33).rem_euclid(1.0);
 
@@ -105,10 +105,10 @@ fn books(u: f64, v: f64, seed: u32) -> Colour {
     let tall = 0.62 + 0.3 * hash2(cell, row, seed);
 
     if height < 0.08 || height > tall {
-        return Colour([0.07, 0.05, 0.04]);
+        return Color([0.07, 0.05, 0.04]);
     }
 
-    let spine = Colour::of_hue(
+    let spine = Color::of_hue(
         hash2(cell, row, seed ^ 0x51),
         0.65,
         0.25 + 0.6 * hash2(cell, row, seed ^ 0x77),
@@ -116,25 +116,25 @@ fn books(u: f64, v: f64, seed: u32) -> Colour {
 
     let band = (0.5..0.6).contains(&(height / tall));
     if band {
-        spine.mixed(Colour::WHITE, 0.7)
+        spine.mixed(Color::WHITE, 0.7)
     } else {
         spine
     }
 }
 
 /// A sheet on a wall: a small painting or printed paper, with equal probability.
-pub(super) fn note(u: f64, v: f64, seed: u32) -> Colour {
+pub(super) fn note(u: f64, v: f64, seed: u32) -> Color {
     if unit(seed, 5) < 0.5 {
         return picture(2.0 * u, 2.0 * v, seed);
     }
 
-    let paper = Colour::of_hue(unit(seed, 8), 0.3 * unit(seed, 9), 0.8);
-    let ink = Colour::of_hue(unit(seed, 10), 0.7, 0.3);
+    let paper = Color::of_hue(unit(seed, 8), 0.3 * unit(seed, 9), 0.8);
+    let ink = Color::of_hue(unit(seed, 10), 0.7, 0.3);
     printed(paper, ink, u, v, seed)
 }
 
 /// Blocks of print, 4 by 2.5 cm: blank, lines of text, or solid ink.
-fn printed(paper: Colour, ink: Colour, u: f64, v: f64, seed: u32) -> Colour {
+fn printed(paper: Color, ink: Color, u: f64, v: f64, seed: u32) -> Color {
     let column = (u / 0.04).floor() as i64;
     let row = (v / 0.025).floor() as i64;
     let kind = hash2(column, row, seed);
@@ -148,24 +148,24 @@ fn printed(paper: Colour, ink: Colour, u: f64, v: f64, seed: u32) -> Colour {
 }
 
 /// Fine detail of a surface (grain, wear, dirt), as a factor of its color. It has three octaves,
-/// from 11 cm down to 8 mm. Octaves too fine for `finest`, the size of a pixel there in metres,
+/// from 11 cm down to 8 mm. Octaves too fine for `finest`, the size of a pixel there in meters,
 /// fade out. `strength` is 0 to 1.
 pub(super) fn detail(u: f64, v: f64, finest: f64, strength: f64, seed: u32) -> f64 {
     // Roughness varies between surfaces.
     let rough = strength * (0.3 + 0.7 * unit(seed, 23));
     let mut sum = 0.0;
 
-    for (octave, (per_metre, amplitude)) in [(9.0, 0.2), (33.0, 0.35), (120.0, 0.45)]
+    for (octave, (per_meter, amplitude)) in [(9.0, 0.2), (33.0, 0.35), (120.0, 0.45)]
         .into_iter()
         .enumerate()
     {
         // Fade out an octave as its cells shrink to 1.5 pixels, to avoid aliasing.
-        let shown = (2.0 - 3.0 * per_metre * finest).clamp(0.0, 1.0);
+        let shown = (2.0 - 3.0 * per_meter * finest).clamp(0.0, 1.0);
         if shown <= 0.0 {
             break;
         }
 
-        let cell = noise(u * per_metre, v * per_metre, seed ^ (octave as u32 + 11));
+        let cell = noise(u * per_meter, v * per_meter, seed ^ (octave as u32 + 11));
         sum += shown * amplitude * (2.0 * cell - 1.0);
     }
 
@@ -173,14 +173,14 @@ pub(super) fn detail(u: f64, v: f64, finest: f64, strength: f64, seed: u32) -> f
 }
 
 /// A random painting: soft shapes in three colors.
-pub(super) fn picture(u: f64, v: f64, seed: u32) -> Colour {
+pub(super) fn picture(u: f64, v: f64, seed: u32) -> Color {
     let a = fractal(u * 5.0, v * 5.0, seed);
     let b = fractal(u * 3.0 + 9.0, v * 6.0, seed ^ 0xa5);
     let hue = unit(seed, 7);
-    let sky = Colour::of_hue(hue, 0.5, 0.85);
+    let sky = Color::of_hue(hue, 0.5, 0.85);
 
-    let land = Colour::of_hue(hue + 0.35, 0.7, 0.45);
-    let dark = Colour::of_hue(hue + 0.6, 0.8, 0.18);
+    let land = Color::of_hue(hue + 0.35, 0.7, 0.45);
+    let dark = Color::of_hue(hue + 0.6, 0.8, 0.18);
     let ground = if a > 0.52 { land } else { sky };
     if b > 0.62 {
         dark

@@ -10,14 +10,14 @@ use super::hand_held::{Goals, Habit, HandPath};
 use super::photograph::Shot;
 use super::solid::Solid;
 use super::suite::{decorate, room_size};
-use super::texture::{Colour, Material};
+use super::texture::{Color, Material};
 use super::{Light, PanelKind, Scene, Shell, Walk, furniture};
 use seese3_core::statistics::normal_deviates;
 
 /// Number of visits to one room.
 const VISITS: usize = 2;
 
-/// Minimum distance of standpoints from the walls, metres. Furniture as high as the camera is less
+/// Minimum distance of standpoints from the walls, meters. Furniture as high as the camera is less
 /// deep.
 const CLEARANCE_M: f64 = 0.85;
 
@@ -197,7 +197,7 @@ fn habit(tour: Tour, size: Vector3<f64>, random: &mut ChaCha8Rng) -> Habit {
     }
 }
 
-/// Maximum offset of a standpoint from the middle of a room, metres.
+/// Maximum offset of a standpoint from the middle of a room, meters.
 fn free(size: Vector3<f64>) -> Vector3<f64> {
     (size / 2.0 - Vector3::repeat(CLEARANCE_M)).map(|reach| reach.max(0.15))
 }
@@ -216,8 +216,8 @@ fn changed(scene: &Scene, moved: bool, random: &mut ChaCha8Rng) -> Scene {
     let small = |solid: &&mut Solid| moved && solid.half.max() < 0.16;
     for solid in scene.solids.iter_mut().filter(small) {
         if random.random_bool(0.25) {
-            solid.centre.x += random.random_range(-0.2..0.2);
-            solid.centre.y += random.random_range(-0.2..0.2);
+            solid.center.x += random.random_range(-0.2..0.2);
+            solid.center.y += random.random_range(-0.2..0.2);
         }
     }
 
@@ -304,8 +304,8 @@ fn passer_by(scene: &Scene, begin: usize, frames: usize, random: &mut ChaCha8Rng
     let aside = if far { size.y - 0.4 } else { 0.4 };
     let clothes = [0.35, 0.6].map(|value| {
         Material::Fabric(
-            Colour::of_hue(random.random_range(0.0..1.0), 0.4, value),
-            Colour::of_hue(random.random_range(0.0..1.0), 0.3, value),
+            Color::of_hue(random.random_range(0.0..1.0), 0.4, value),
+            Color::of_hue(random.random_range(0.0..1.0), 0.3, value),
         )
     });
 
@@ -316,14 +316,14 @@ fn passer_by(scene: &Scene, begin: usize, frames: usize, random: &mut ChaCha8Rng
         (
             1.6,
             [0.09, 0.08, 0.12],
-            Material::Plain(Colour::of_hue(0.06, 0.4, random.random_range(0.3..0.8))),
+            Material::Plain(Color::of_hue(0.06, 0.4, random.random_range(0.3..0.8))),
         ),
     ];
 
     PasserBy {
         body: body
             .map(|(height, half, material)| Solid {
-                centre: Point3::new(0.0, aside, height),
+                center: Point3::new(0.0, aside, height),
                 half: Vector3::from(half),
                 cos: 1.0,
                 sin: 0.0,
@@ -358,7 +358,7 @@ mod tests {
 
                 for solid in &scene.solids {
                     let clear = solid
-                        .turned_back(at - solid.centre)
+                        .turned_back(at - solid.center)
                         .iter()
                         .zip(&solid.half)
                         .any(|(off, half)| off.abs() > half + 0.05);
@@ -397,15 +397,15 @@ mod tests {
             let nearest = |frame: usize| {
                 (0..800)
                     .map(|other| apart(frame, other))
-                    .map(|(metres, angle)| metres + 0.01 * angle.to_degrees())
+                    .map(|(meters, angle)| meters + 0.01 * angle.to_degrees())
                     .fold(f64::INFINITY, f64::min)
             };
             away.push(median((800..1_000).step_by(10).map(nearest).collect()));
 
             for frame in (1..1_000).filter(|&frame| frame != 500) {
-                let (metres, angle) = apart(frame - 1, frame);
+                let (meters, angle) = apart(frame - 1, frame);
                 assert!(
-                    metres < 0.06 && angle < 0.08,
+                    meters < 0.06 && angle < 0.08,
                     "room {number}, frame {frame}"
                 );
             }
@@ -480,9 +480,9 @@ mod tests {
 
             for frame in 201..400 {
                 let step = one.poses[frame - 1].inv_mul(&one.poses[frame]);
-                let metres = step.translation.vector.norm();
+                let meters = step.translation.vector.norm();
                 let angle = step.rotation.angle().to_degrees();
-                assert!(metres < 0.07 && angle < 6.0, "room {number}, frame {frame}");
+                assert!(meters < 0.07 && angle < 6.0, "room {number}, frame {frame}");
             }
         }
 

@@ -20,7 +20,7 @@ pub fn room(name: &str) -> Room {
 
     let provenance = Provenance {
         format: "test".to_owned(),
-        licence: "CC0".to_owned(),
+        license: "CC0".to_owned(),
         images_root: "/recordings/a".to_owned(),
         worst_rotation_deviation: 1e-4,
         camera: Some(

@@ -9,7 +9,7 @@ use ndarray::{Array2, ArrayView2, Axis, concatenate, s};
 
 use super::Real;
 use super::layers::{
-    cumulative, gelu_backward, linear, linear_initial, normalise, normalise_backward, within,
+    cumulative, gelu_backward, linear, linear_initial, normalize, normalize_backward, within,
 };
 use super::seeded::Seeded;
 
@@ -65,7 +65,7 @@ type AttentionWeights<T> = [[[T; 2]; 2]; HEADS];
 
 /// Intermediate values and output of a LayerNorm's forward pass.
 struct Normed<T> {
-    normalised: Array2<T>,
+    normalized: Array2<T>,
     inverse_deviation: Array2<T>,
     output: Array2<T>,
 }
@@ -163,12 +163,12 @@ impl<T: Real> Attention<T> {
     }
 
     fn norm(&self, input: &Array2<T>, at: usize) -> Normed<T> {
-        let mut normalised = input.clone();
-        let inverse_deviation = normalise(&mut normalised);
-        let output = &normalised * &self.tensors[at] + &self.tensors[at + 1];
+        let mut normalized = input.clone();
+        let inverse_deviation = normalize(&mut normalized);
+        let output = &normalized * &self.tensors[at] + &self.tensors[at + 1];
 
         Normed {
-            normalised,
+            normalized,
             inverse_deviation,
             output,
         }
@@ -267,10 +267,10 @@ impl<T: Real> Attention<T> {
         d: Array2<T>,
         gradient: &mut Self,
     ) -> Array2<T> {
-        gradient.tensors[at] += &(&d * &forward.normalised).sum_axis(Axis(0));
+        gradient.tensors[at] += &(&d * &forward.normalized).sum_axis(Axis(0));
         gradient.tensors[at + 1] += &d.sum_axis(Axis(0));
         let mut d = d * &self.tensors[at];
-        normalise_backward(&mut d, &forward.normalised, &forward.inverse_deviation);
+        normalize_backward(&mut d, &forward.normalized, &forward.inverse_deviation);
 
         d
     }

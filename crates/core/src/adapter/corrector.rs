@@ -339,13 +339,13 @@ fn corrector_samples(
     };
 
     let scale = adapter.scale();
-    let normalised: Vec<_> = samples
+    let normalized: Vec<_> = samples
         .twists()
         .iter()
-        .map(|&twist| scale.normalised(twist))
+        .map(|&twist| scale.normalized(twist))
         .collect();
     let motions = Array2::from_shape_fn((n, 6), |(pair, component)| {
-        normalised[pair][component] as f32
+        normalized[pair][component] as f32
     });
 
     Ok(CorrectorSamples {

@@ -11,7 +11,7 @@ use super::{Error, Whitener};
 
 /// Rows to each side of a frame that count as its temporal neighbors. They are near it because
 /// little time has passed, not because the camera revisits a place.
-pub const TEMPORAL_NEIGHBOURS: u32 = 10;
+pub const TEMPORAL_NEIGHBORS: u32 = 10;
 
 /// Error covariances, tabulated by one predictor of their size, the distance of a match.
 #[derive(Debug, Clone, PartialEq)]

@@ -60,7 +60,7 @@ pub(super) fn linear<T: Real>(
 
 /// Normalizes every row to mean 0 and standard deviation 1. Returns the reciprocals of the standard
 /// deviations, shape (n, 1).
-pub(super) fn normalise<T: Real>(rows: &mut Array2<T>) -> Array2<T> {
+pub(super) fn normalize<T: Real>(rows: &mut Array2<T>) -> Array2<T> {
     let width = T::of(rows.ncols() as f64);
     let mut inverse_deviation = Array2::zeros((rows.nrows(), 1));
     for (mut row, mut scale) in rows
@@ -78,30 +78,30 @@ pub(super) fn normalise<T: Real>(rows: &mut Array2<T>) -> Array2<T> {
     inverse_deviation
 }
 
-/// Turns `d` from the gradient with respect to the output of [`normalise`] into the gradient with
+/// Turns `d` from the gradient with respect to the output of [`normalize`] into the gradient with
 /// respect to its input.
-pub(super) fn normalise_backward<T: Real>(
+pub(super) fn normalize_backward<T: Real>(
     d: &mut Array2<T>,
-    normalised: &Array2<T>,
+    normalized: &Array2<T>,
     inverse_deviation: &Array2<T>,
 ) {
     let width = T::of(d.ncols() as f64);
-    for ((mut row, normalised), scale) in d
+    for ((mut row, normalized), scale) in d
         .outer_iter_mut()
-        .zip(normalised.outer_iter())
+        .zip(normalized.outer_iter())
         .zip(inverse_deviation.iter())
     {
-        // With y = (x − mean)/deviation (`normalised`), where mean and deviation depend on x too:
+        // With y = (x − mean)/deviation (`normalized`), where mean and deviation depend on x too:
         // dx = (dy − mean(dy) − y · mean(dy ⊙ y)) / deviation.
         let mean = row.sum() / width;
 
         let along = row
             .iter()
-            .zip(&normalised)
+            .zip(&normalized)
             .fold(T::zero(), |sum, (&d, &x)| sum + d * x)
             / width;
         Zip::from(&mut row)
-            .and(&normalised)
+            .and(&normalized)
             .for_each(|d, &x| *d = *scale * (*d - mean - x * along));
     }
 }

@@ -228,17 +228,17 @@ impl<T: Real> Mixture<T> {
 
     /// Converts charts trained on (z − mean)/deviation, each (1, d), to charts for z. A gate has no
     /// bias that could absorb the mean, so training refuses this combination with
-    /// [`Error::GatedStandardised`].
-    pub(super) fn fold_standardisation(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
+    /// [`Error::GatedStandardized`].
+    pub(super) fn fold_standardization(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
         for chart in &mut self.charts {
-            chart.phi.fold_standardisation(mean, deviation);
+            chart.phi.fold_standardization(mean, deviation);
         }
     }
 
-    /// Undoes [`Mixture::fold_standardisation`].
-    pub(super) fn unfold_standardisation(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
+    /// Undoes [`Mixture::fold_standardization`].
+    pub(super) fn unfold_standardization(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
         for chart in &mut self.charts {
-            chart.phi.unfold_standardisation(mean, deviation);
+            chart.phi.unfold_standardization(mean, deviation);
         }
     }
 

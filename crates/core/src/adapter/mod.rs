@@ -28,7 +28,7 @@ mod trained;
 mod whitener;
 
 pub use corrector::{Corrector, CorrectorKind, CorrectorSamples, train_corrector};
-pub use error_model::{ErrorModel, ErrorStatistics, ErrorTable, Stratum, TEMPORAL_NEIGHBOURS};
+pub use error_model::{ErrorModel, ErrorStatistics, ErrorTable, Stratum, TEMPORAL_NEIGHBORS};
 pub use inverse::{Inverse, Reading};
 pub use loss::Loss;
 pub use mixture::{Mixing, Mixture, ROUTE_DIM};
@@ -101,8 +101,8 @@ pub enum Error {
     GatedMotion,
     #[error("whitening takes latents of at most {most} columns, these have {actual}")]
     WhitenedColumns { actual: usize, most: usize },
-    #[error("features cannot be standardised for charts mixed by a gate; use --mixing even")]
-    GatedStandardised,
+    #[error("features cannot be standardized for charts mixed by a gate; use --mixing even")]
+    GatedStandardized,
     #[error("the covariance of an adapter's errors must be symmetric and positive definite")]
     ErrorCovariance,
     #[error(
@@ -201,13 +201,13 @@ impl TargetScale {
     }
 
     /// The z-scored motion, (ΔP − μ) / σ.
-    pub fn normalised(&self, twist: Twist) -> Vector6<f64> {
+    pub fn normalized(&self, twist: Twist) -> Vector6<f64> {
         (twist.to_vector() - self.mean).component_div(&self.deviation)
     }
 
     /// The motion with the z-score y, σ ⊙ y + μ.
-    pub fn twist(&self, normalised: &Vector6<f64>) -> Twist {
-        Twist::from_vector(&(normalised.component_mul(&self.deviation) + self.mean))
+    pub fn twist(&self, normalized: &Vector6<f64>) -> Twist {
+        Twist::from_vector(&(normalized.component_mul(&self.deviation) + self.mean))
     }
 }
 

@@ -5,7 +5,7 @@ use ndarray::{Array2, Axis};
 
 use super::Real;
 use super::layers::{
-    cumulative, gelu_backward, linear, linear_initial, normalise, normalise_backward,
+    cumulative, gelu_backward, linear, linear_initial, normalize, normalize_backward,
 };
 use super::seeded::Seeded;
 
@@ -30,7 +30,7 @@ pub struct Phi<T> {
 /// Intermediate values of the forward pass that the backward pass uses.
 pub struct Activations<T> {
     input: Array2<T>,
-    normalised: Array2<T>,
+    normalized: Array2<T>,
     inverse_deviation: Array2<T>,
     scaled: Array2<T>,
     cumulative: Array2<T>,
@@ -133,7 +133,7 @@ impl<T: Real> Phi<T> {
 
     /// Folds the z-scoring of features into the first layer: W₁(z − m)/s + b₁ = (W₁/s) z + (b₁ −
     /// (W₁/s) m).
-    pub(super) fn fold_standardisation(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
+    pub(super) fn fold_standardization(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
         let [first_weight, first_bias, ..] = &mut self.tensors;
 
         // In f64, because (W₁/s) m can be far larger than b₁.
@@ -145,8 +145,8 @@ impl<T: Real> Phi<T> {
         *first_bias = bias.mapv(T::of);
     }
 
-    /// Undoes [`Phi::fold_standardisation`]: converts a φ for z to a φ for (z − m)/s.
-    pub(super) fn unfold_standardisation(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
+    /// Undoes [`Phi::fold_standardization`]: converts a φ for z to a φ for (z − m)/s.
+    pub(super) fn unfold_standardization(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
         let [first_weight, first_bias, ..] = &mut self.tensors;
 
         let wide = |tensor: &Array2<T>| tensor.mapv(|x| x.f64());
@@ -167,9 +167,9 @@ impl<T: Real> Phi<T> {
             last_bias,
         ] = &self.tensors;
 
-        let mut normalised = linear(&input, first_weight, first_bias);
-        let inverse_deviation = normalise(&mut normalised);
-        let scaled = &normalised * norm_weight + norm_bias;
+        let mut normalized = linear(&input, first_weight, first_bias);
+        let inverse_deviation = normalize(&mut normalized);
+        let scaled = &normalized * norm_weight + norm_bias;
 
         // GELU(x) = x Φ(x). Φ(x) is kept for the derivative.
         let cumulative = cumulative(&scaled);
@@ -178,7 +178,7 @@ impl<T: Real> Phi<T> {
 
         Activations {
             input,
-            normalised,
+            normalized,
             inverse_deviation,
             scaled,
             cumulative,
@@ -200,12 +200,12 @@ impl<T: Real> Phi<T> {
         gelu_backward(&mut d_scaled, &forward.scaled, &forward.cumulative);
 
         // LayerNorm backward: first weight and bias, then the normalization.
-        gradient.tensors[2] += &(&d_scaled * &forward.normalised).sum_axis(Axis(0));
+        gradient.tensors[2] += &(&d_scaled * &forward.normalized).sum_axis(Axis(0));
         gradient.tensors[3] += &d_scaled.sum_axis(Axis(0));
         let mut d_first = d_scaled * norm_weight;
-        normalise_backward(
+        normalize_backward(
             &mut d_first,
-            &forward.normalised,
+            &forward.normalized,
             &forward.inverse_deviation,
         );
 

@@ -63,7 +63,7 @@ impl Preset {
             Self::Steady => TrainConfig {
                 epochs: 17,
                 learning_rate: 3e-4,
-                standardise: true,
+                standardize: true,
                 noise: 0.5,
                 average: 0.99,
                 through_zero: true,

@@ -39,7 +39,7 @@ pub struct TrainingRecord {
 impl TrainingRecord {
     /// Number of optimizer steps: batches per epoch times epochs. The epochs of an ensemble are
     /// divided among its charts.
-    pub fn optimiser_steps(&self) -> u64 {
+    pub fn optimizer_steps(&self) -> u64 {
         let batches = self.pair_count.div_ceil(self.config.batch.max(1)) as u64;
         let is_ensemble = self.config.charts > 1 && self.config.mixing == Mixing::Even;
         let epochs = if is_ensemble {

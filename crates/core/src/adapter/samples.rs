@@ -108,12 +108,12 @@ impl<T: Real> Samples<T> {
             return Err(Error::NoMotion);
         }
 
-        let normalised: Vec<_> = twists
+        let normalized: Vec<_> = twists
             .iter()
-            .map(|&twist| scale.normalised(twist))
+            .map(|&twist| scale.normalized(twist))
             .collect();
         let targets = Array2::from_shape_fn((twists.len(), 6), |(row, column)| {
-            T::of(normalised[row][column])
+            T::of(normalized[row][column])
         });
 
         Ok(Self {
@@ -201,7 +201,7 @@ impl Samples<f32> {
     /// The same samples with z-scored features, and the mean and population standard deviation
     /// used, each (1, d). The statistics are those of the rows that occur in pairs, with the lower
     /// bound of [`column_scale`].
-    pub(super) fn standardised(&self) -> (Self, [Array2<f32>; 2]) {
+    pub(super) fn standardized(&self) -> (Self, [Array2<f32>; 2]) {
         // Frames in no training pair, such as test frames, are excluded from the statistics.
         let mut used = vec![false; self.features.nrows()];
         self.pairs

@@ -38,9 +38,10 @@ pub struct TrainConfig {
     pub loss: Loss,
     /// Whether features are z-scored by the statistics of the training frames. After training, the
     /// scaling is folded into the first layer.
-    pub standardise: bool,
+    #[cfg_attr(feature = "serde", serde(alias = "standardise"))]
+    pub standardize: bool,
     /// Standard deviation of the Gaussian noise added to the features at every step. The unit is
-    /// that of the features after z-scoring, if `standardise` is set.
+    /// that of the features after z-scoring, if `standardize` is set.
     pub noise: f64,
     /// Decay of the exponential moving average of the weights, which is the result of the training;
     /// at 0, the last weights are.
@@ -65,7 +66,7 @@ impl Default for TrainConfig {
             charts: 1,
             mixing: Mixing::Gate,
             loss: Loss::MeanSquaredError,
-            standardise: false,
+            standardize: false,
             noise: 0.0,
             average: 0.0,
             through_zero: false,
@@ -88,19 +89,19 @@ pub struct Trainer<'a, T: Real, N: Objective<T>> {
     data: &'a N::Data,
     config: TrainConfig,
     weights: N,
-    optimiser: AdamW<T>,
+    optimizer: AdamW<T>,
     steps: u64,
 }
 
 impl<'a, T: Real, N: Objective<T>> Trainer<'a, T, N> {
     /// Starts a training run from `weights`.
     pub fn new(data: &'a N::Data, weights: N, config: TrainConfig) -> Self {
-        let optimiser = AdamW::new(&weights);
+        let optimizer = AdamW::new(&weights);
         Self {
             data,
             config,
             weights,
-            optimiser,
+            optimizer,
             steps: 0,
         }
     }
@@ -127,7 +128,7 @@ impl<'a, T: Real, N: Objective<T>> Trainer<'a, T, N> {
         let (loss, gradient) = self.gradient(batch);
         self.steps += 1;
         let gradient_norm = self
-            .optimiser
+            .optimizer
             .step(&mut self.weights, &gradient, &self.config);
 
         StepReport {
@@ -211,7 +212,7 @@ fn move_towards<T: Real, N: Objective<T>>(average: &mut N, weights: &N, share: f
 ///
 /// # Errors
 /// [`Error::Diverged`] when the loss is not finite, [`Error::Charts`] when the number of charts is
-/// 0 or above [`super::MAX_CHARTS`], [`Error::GatedStandardised`] for z-scored features with a
+/// 0 or above [`super::MAX_CHARTS`], [`Error::GatedStandardized`] for z-scored features with a
 /// gate.
 ///
 /// Source: SeeSE3, Sec. A.2; mixtures Sec. A.11.
@@ -227,8 +228,8 @@ pub fn train(
         });
     }
 
-    if config.charts > 1 && config.mixing == Mixing::Gate && config.standardise {
-        return Err(Error::GatedStandardised);
+    if config.charts > 1 && config.mixing == Mixing::Gate && config.standardize {
+        return Err(Error::GatedStandardized);
     }
 
     // A single chart, or charts with a gate, are one network; the charts of an ensemble are trained
@@ -291,7 +292,7 @@ pub fn train_further(
     }
 
     let mut random = Seeded::new(config.seed);
-    if !config.standardise {
+    if !config.standardize {
         return fit(
             samples,
             start.clone(),
@@ -304,19 +305,19 @@ pub fn train_further(
 
     // The network takes raw features: it is converted for z-scored features, trained, and converted
     // back.
-    let (standardised, [mean, deviation]) = samples.standardised();
+    let (standardized, [mean, deviation]) = samples.standardized();
     let mut unfolded = start.clone();
-    unfolded.unfold_standardisation(&mean, &deviation);
+    unfolded.unfold_standardization(&mean, &deviation);
 
     let mut network = fit(
-        &standardised,
+        &standardized,
         unfolded,
         config,
         &mut random,
         cancel,
         progress,
     )?;
-    network.fold_standardisation(&mean, &deviation);
+    network.fold_standardization(&mean, &deviation);
     Ok(network)
 }
 
@@ -337,15 +338,15 @@ fn train_together(
 
     let mut random = Seeded::new(config.seed);
     let start = Mixture::random(widths, config.charts, &mut random);
-    if !config.standardise {
+    if !config.standardize {
         return fit(samples, start, config, &mut random, cancel, progress);
     }
 
     // Train on z-scored features, then fold the scaling into the first layer, so that the network
     // takes raw features.
-    let (standardised, [mean, deviation]) = samples.standardised();
-    let mut network = fit(&standardised, start, config, &mut random, cancel, progress)?;
-    network.fold_standardisation(&mean, &deviation);
+    let (standardized, [mean, deviation]) = samples.standardized();
+    let mut network = fit(&standardized, start, config, &mut random, cancel, progress)?;
+    network.fold_standardization(&mean, &deviation);
 
     Ok(network)
 }

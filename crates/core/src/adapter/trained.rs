@@ -296,7 +296,7 @@ impl Adapter {
     ///
     /// Source: SeeSE3, Eq. 3, with the z-scoring of the targets undone.
     pub fn motion(&self, from: ArrayView1<'_, f64>, to: ArrayView1<'_, f64>) -> Twist {
-        let normalised = match self.network_f64.charts() {
+        let normalized = match self.network_f64.charts() {
             [chart] => chart.motion_matrix().dot(&(&to - &from)),
             _ => {
                 let coordinates = s![..self.coordinate_count()];
@@ -309,7 +309,7 @@ impl Adapter {
         };
 
         self.scale
-            .twist(&Vector6::from_fn(|row, _| normalised[row]))
+            .twist(&Vector6::from_fn(|row, _| normalized[row]))
     }
 
     /// [`Adapter::motion`] without μ: equal latents give zero motion (A-16, homogeneous).

@@ -26,18 +26,18 @@ pub struct Baselines {
     /// meters plus radians). `None` if the adapter was not trained on these frames.
     pub nearest_pose: Option<PoseError>,
     /// Number of optimizer steps; 0 for a closed-form fit.
-    pub optimiser_steps: u64,
+    pub optimizer_steps: u64,
 }
 
 impl Baselines {
-    /// Baselines for an adapter with the target scale `scale`, trained in `optimiser_steps`.
+    /// Baselines for an adapter with the target scale `scale`, trained in `optimizer_steps`.
     /// `learned_here` is true if it was trained on these frames.
     ///
     /// # Errors
     /// [`splits::Error`] when the room has no test pairs.
     pub fn of(
         scale: &TargetScale,
-        optimiser_steps: u64,
+        optimizer_steps: u64,
         room: &Room,
         test: &TestPairs,
         learned_here: bool,
@@ -69,7 +69,7 @@ impl Baselines {
             constant_r2: constant_r2(&truth, &scale.mean),
             variance_ratio: mean_of_known(&ratios),
             nearest_pose,
-            optimiser_steps,
+            optimizer_steps,
         })
     }
 
@@ -80,12 +80,12 @@ impl Baselines {
     pub fn within(
         room: &Room,
         test: &TestPairs,
-        optimiser_steps: u64,
+        optimizer_steps: u64,
     ) -> Result<Self, splits::Error> {
         let training = test.split.train_pairs(room.timeline(), test.stride)?;
         let scale = TargetScale::of(&motions(room.poses(), &training));
 
-        Self::of(&scale, optimiser_steps, room, test, true)
+        Self::of(&scale, optimizer_steps, room, test, true)
     }
 
     /// Whether R² is informative in this recording: the constant baseline is at least
@@ -123,10 +123,10 @@ fn nearest_pose(poses: &[Pose], training: &[Pair], tested: &[Pair]) -> Option<Po
         return None;
     }
 
-    let metres: Vec<f64> = nearest.iter().map(|error| error.translation_m).collect();
+    let meters: Vec<f64> = nearest.iter().map(|error| error.translation_m).collect();
     let radians: Vec<f64> = nearest.iter().map(|error| error.rotation_rad).collect();
     Some(PoseError {
-        translation_m: median(&metres),
+        translation_m: median(&meters),
         rotation_rad: median(&radians),
     })
 }

@@ -240,7 +240,7 @@ impl TableInputs<'_> {
                     // Only coordinates are scored, not the gate weights of a mixture.
                     row.assign(&end.latent.slice(s![..self.adapter.coordinate_count()]));
 
-                    retrieved.push(end.neighbours[0].frame);
+                    retrieved.push(end.neighbors[0].frame);
                 }
 
                 Ok(self.scored(kind, &predicted, &retrieved))
@@ -395,10 +395,10 @@ impl TableInputs<'_> {
         }
     }
 
-    fn exclusion(&self, centre: FrameId) -> Option<Exclusion> {
+    fn exclusion(&self, center: FrameId) -> Option<Exclusion> {
         self.protocol
             .exclude_source
-            .map(|radius| Exclusion { centre, radius })
+            .map(|radius| Exclusion { center, radius })
     }
 
     fn coordinates_of(&self, frames: impl Iterator<Item = FrameId>) -> Array2<f64> {

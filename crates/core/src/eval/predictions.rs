@@ -152,7 +152,7 @@ impl Scoring<'_> {
         }
 
         let exclusion = self.scope.exclude_source.map(|radius| Exclusion {
-            centre: started_from,
+            center: started_from,
             radius,
         });
 

@@ -34,7 +34,7 @@ mod tests {
 
     /// Oracle: by hand, 3-4-5 in the plane and a quarter turn.
     #[test]
-    fn a_quarter_turn_five_metres_away() {
+    fn a_quarter_turn_five_meters_away() {
         let found = Pose::new(Vector3::new(1.0, 0.0, 0.0), Vector3::zeros());
 
         let truth = Pose::new(

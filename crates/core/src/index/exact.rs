@@ -3,7 +3,7 @@
 
 use ndarray::ArrayView2;
 
-use super::{Exclusion, Index, Nearest, Neighbour, distance};
+use super::{Exclusion, Index, Nearest, Neighbor, distance};
 use crate::room::FrameId;
 
 /// Latents by row, and the frame of each row.
@@ -30,12 +30,12 @@ impl ExactIndex {
 }
 
 impl Index for ExactIndex {
-    fn nearest(&self, query: &[f64], k: usize, exclusion: Option<Exclusion>) -> Vec<Neighbour> {
+    fn nearest(&self, query: &[f64], k: usize, exclusion: Option<Exclusion>) -> Vec<Neighbor> {
         let mut nearest = Nearest::new(k);
         for (row, &frame) in self.values.chunks_exact(self.width).zip(&self.frames) {
             if !exclusion.is_some_and(|exclusion| exclusion.covers(frame)) {
                 let distance = distance(row, query);
-                nearest.offer(Neighbour { frame, distance });
+                nearest.offer(Neighbor { frame, distance });
             }
         }
 

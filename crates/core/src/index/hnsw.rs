@@ -10,7 +10,7 @@ use std::collections::BTreeSet;
 use hnsw_rs::prelude::{DistL2, Hnsw};
 use ndarray::ArrayView2;
 
-use super::{Audit, ExactIndex, Exclusion, Index, Neighbour, by_distance_then_frame, distance};
+use super::{Audit, ExactIndex, Exclusion, Index, Neighbor, by_distance_then_frame, distance};
 use crate::room::FrameId;
 
 const MOST_LAYERS: usize = 16;
@@ -143,7 +143,7 @@ impl HnswIndex {
 }
 
 impl Index for HnswIndex {
-    fn nearest(&self, query: &[f64], k: usize, exclusion: Option<Exclusion>) -> Vec<Neighbour> {
+    fn nearest(&self, query: &[f64], k: usize, exclusion: Option<Exclusion>) -> Vec<Neighbor> {
         // The graph does not support exclusions: search for as many more frames as can be excluded.
         let wanted = k
             .saturating_add(exclusion.map_or(0, |exclusion| exclusion.most()))
@@ -161,27 +161,27 @@ impl Index for HnswIndex {
             .collect();
 
         // Replace the graph's f32 distances by f64 distances from the latents.
-        let mut neighbours: Vec<Neighbour> = positions
+        let mut neighbors: Vec<Neighbor> = positions
             .into_iter()
             .filter(|&position| {
                 !exclusion.is_some_and(|exclusion| exclusion.covers(self.frames[position]))
             })
-            .map(|position| Neighbour {
+            .map(|position| Neighbor {
                 frame: self.frames[position],
                 distance: distance(&self.latents[position], query),
             })
             .collect();
 
-        neighbours.sort_by(by_distance_then_frame);
-        neighbours.truncate(k);
+        neighbors.sort_by(by_distance_then_frame);
+        neighbors.truncate(k);
 
-        if neighbours.len() < k.min(self.frames.len()) {
+        if neighbors.len() < k.min(self.frames.len()) {
             // Too few frames, for instance from a disconnected part of the graph. The contract
             // requires all remaining frames up to k: fall back to the exact scan.
             return self.exact.nearest(query, k, exclusion);
         }
 
-        neighbours
+        neighbors
     }
 
     fn memory_bytes(&self) -> usize {

@@ -16,7 +16,7 @@ use crate::room::FrameId;
 
 /// A frame and the distance of its latent from the query.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Neighbour {
+pub struct Neighbor {
     /// The frame.
     pub frame: FrameId,
     /// L2 distance in latent units.
@@ -39,11 +39,11 @@ pub struct Audit {
     pub queries: usize,
 }
 
-/// Frames that are excluded from retrieval: all within `radius` rows of `centre`.
+/// Frames that are excluded from retrieval: all within `radius` rows of `center`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Exclusion {
     /// The center frame.
-    pub centre: FrameId,
+    pub center: FrameId,
     /// Number of rows excluded to each side; 0 excludes the center only.
     pub radius: u32,
 }
@@ -51,7 +51,7 @@ pub struct Exclusion {
 impl Exclusion {
     /// Whether a frame is excluded.
     pub fn covers(&self, frame: FrameId) -> bool {
-        frame.0.abs_diff(self.centre.0) <= self.radius
+        frame.0.abs_diff(self.center.0) <= self.radius
     }
 
     /// Maximum number of excluded frames.
@@ -64,7 +64,7 @@ impl Exclusion {
 /// Nearest-neighbor search among the latents of frames.
 pub trait Index: Send + Sync {
     /// The `k` nearest frames to `query`, ordered by distance, then by frame.
-    fn nearest(&self, query: &[f64], k: usize, exclusion: Option<Exclusion>) -> Vec<Neighbour>;
+    fn nearest(&self, query: &[f64], k: usize, exclusion: Option<Exclusion>) -> Vec<Neighbor>;
 
     /// Number of indexed frames.
     fn len(&self) -> usize;
@@ -79,7 +79,7 @@ pub trait Index: Send + Sync {
 }
 
 /// The order of results: by distance, then by frame.
-fn by_distance_then_frame(a: &Neighbour, b: &Neighbour) -> std::cmp::Ordering {
+fn by_distance_then_frame(a: &Neighbor, b: &Neighbor) -> std::cmp::Ordering {
     a.distance
         .total_cmp(&b.distance)
         .then(a.frame.cmp(&b.frame))
@@ -107,7 +107,7 @@ pub fn distance(a: &[f64], b: &[f64]) -> f64 {
 pub struct Nearest {
     count: usize,
     /// Always sorted, with at most `count` entries.
-    best: Vec<Neighbour>,
+    best: Vec<Neighbor>,
 }
 
 impl Nearest {
@@ -121,7 +121,7 @@ impl Nearest {
 
     /// Adds a neighbor if it is among the nearest so far.
     #[inline]
-    pub fn offer(&mut self, found: Neighbour) {
+    pub fn offer(&mut self, found: Neighbor) {
         // Fast path: most neighbors are farther than the worst so far.
         let is_full = self.best.len() == self.count;
         let worst = self.best.last();
@@ -131,15 +131,15 @@ impl Nearest {
         self.insert(found);
     }
 
-    fn insert(&mut self, found: Neighbour) {
-        let is_before = |other: &Neighbour| by_distance_then_frame(other, &found).is_lt();
+    fn insert(&mut self, found: Neighbor) {
+        let is_before = |other: &Neighbor| by_distance_then_frame(other, &found).is_lt();
         let place = self.best.partition_point(is_before);
         self.best.insert(place, found);
         self.best.truncate(self.count);
     }
 
     /// The collected neighbors, sorted.
-    pub fn found(self) -> Vec<Neighbour> {
+    pub fn found(self) -> Vec<Neighbor> {
         self.best
     }
 }

@@ -7,7 +7,7 @@ use super::{Error, Search, Stepper};
 use crate::adapter::Adapter;
 use crate::cancel::Cancellation;
 use crate::geometry::{Pose, Twist, body_twist};
-use crate::index::{Exclusion, Neighbour};
+use crate::index::{Exclusion, Neighbor};
 use crate::room::FrameId;
 
 /// How the steps of one motion are chained.
@@ -80,7 +80,7 @@ pub struct Step {
     /// ĝ, the predicted latent.
     pub latent: Array1<f64>,
     /// The frames nearest to ĝ; at least one.
-    pub neighbours: Vec<Neighbour>,
+    pub neighbors: Vec<Neighbor>,
 }
 
 /// One motion of a query.
@@ -172,17 +172,17 @@ pub fn walk(
         let exclusion = plan
             .exclude_source
             .zip(at.frame)
-            .map(|(radius, centre)| Exclusion { centre, radius });
-        let neighbours = space.search.nearest(latent.view(), plan.top_k, exclusion);
+            .map(|(radius, center)| Exclusion { center, radius });
+        let neighbors = space.search.nearest(latent.view(), plan.top_k, exclusion);
 
-        let Some(first) = neighbours.first() else {
+        let Some(first) = neighbors.first() else {
             return Err(Error::NoCandidates {
                 frame_count: space.poses.len(),
             });
         };
 
         at = plan.mode.next_start(&at, &latent, first.frame, space);
-        steps.push(Step { latent, neighbours });
+        steps.push(Step { latent, neighbors });
     }
 
     Ok(steps)

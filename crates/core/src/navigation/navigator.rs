@@ -13,7 +13,7 @@ use crate::adapter::Adapter;
 use crate::cancel::Cancellation;
 use crate::features::Features;
 use crate::geometry::{Pose, PoseError, Twist, body_twist, exp};
-use crate::index::{Audit, Neighbour};
+use crate::index::{Audit, Neighbor};
 use crate::room::Room;
 use crate::splits::Pair;
 
@@ -24,7 +24,7 @@ const MOST_REFITS: usize = 32;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RetrievedFrame {
     /// The frame and its distance to the query latent.
-    pub neighbour: Neighbour,
+    pub neighbor: Neighbor,
     /// Its pose, `world_from_camera`.
     pub pose: Pose,
 }
@@ -314,7 +314,7 @@ impl Navigator {
 
                 from = query
                     .mode
-                    .next_start(&from, &step.latent, step.neighbours[0].frame, space);
+                    .next_start(&from, &step.latent, step.neighbors[0].frame, space);
                 steps.push(self.answer_step(step, start.pose, wanted));
             }
         }
@@ -364,7 +364,7 @@ impl Navigator {
         source: Option<Pose>,
         requested: Option<Pose>,
     ) -> AnswerStep {
-        let frames = self.retrieved(&step.neighbours);
+        let frames = self.retrieved(&step.neighbors);
         let error = source
             .zip(requested)
             .map(|(source, requested)| StepError::of(&source, &frames[0].pose, &requested));
@@ -377,12 +377,12 @@ impl Navigator {
         }
     }
 
-    fn retrieved(&self, neighbours: &[Neighbour]) -> Vec<RetrievedFrame> {
-        neighbours
+    fn retrieved(&self, neighbors: &[Neighbor]) -> Vec<RetrievedFrame> {
+        neighbors
             .iter()
-            .map(|&neighbour| RetrievedFrame {
-                neighbour,
-                pose: self.room.poses()[neighbour.frame.row()],
+            .map(|&neighbor| RetrievedFrame {
+                neighbor,
+                pose: self.room.poses()[neighbor.frame.row()],
             })
             .collect()
     }

@@ -140,10 +140,10 @@ pub fn pursue(
 
                 latent = navigator
                     .latents()
-                    .row(frame.neighbour.frame.row())
+                    .row(frame.neighbor.frame.row())
                     .to_owned();
 
-                seen.insert(frame.neighbour.frame);
+                seen.insert(frame.neighbor.frame);
 
                 each(Feedback {
                     step,
@@ -216,7 +216,7 @@ fn progress<'a>(
 ) -> Progress<'a> {
     let distance = |frame: &RetrievedFrame| body_twist(&frame.pose, goal).norm();
     let is_nearer = |frame: &&RetrievedFrame| {
-        distance(frame) < left.norm() && !seen.contains(&frame.neighbour.frame)
+        distance(frame) < left.norm() && !seen.contains(&frame.neighbor.frame)
     };
 
     match frames.first().filter(is_nearer) {

@@ -5,7 +5,7 @@ use ndarray::{Array2, ArrayView1, ArrayView2, Axis, s};
 use strum::{Display, VariantArray};
 
 use crate::adapter::{Adapter, Error};
-use crate::index::{Audit, ExactIndex, Exclusion, Index, Neighbour};
+use crate::index::{Audit, ExactIndex, Exclusion, Index, Neighbor};
 #[cfg(feature = "hnsw")]
 use crate::index::{HnswIndex, HnswParameters};
 use crate::matrices::{to_nalgebra, to_ndarray};
@@ -169,8 +169,8 @@ fn blocks(parts: &[Array2<f64>]) -> Array2<f64> {
 /// variance get weight zero.
 fn whitening(rows: ArrayView2<'_, f64>) -> Array2<f64> {
     let count = rows.nrows().max(1) as f64;
-    let centred = &rows - &(rows.sum_axis(Axis(0)) / count);
-    let covariance = centred.t().dot(&centred) / count;
+    let centered = &rows - &(rows.sum_axis(Axis(0)) / count);
+    let covariance = centered.t().dot(&centered) / count;
     let eigen = SymmetricEigen::new(to_nalgebra(covariance.view()));
     let largest = eigen.eigenvalues.iter().copied().fold(0.0, f64::max);
 
@@ -252,7 +252,7 @@ impl Search {
         latent: ArrayView1<'_, f64>,
         k: usize,
         exclusion: Option<Exclusion>,
-    ) -> Vec<Neighbour> {
+    ) -> Vec<Neighbor> {
         self.index
             .nearest(&self.projection.one(latent), k, exclusion)
     }
@@ -285,8 +285,8 @@ mod tests {
         let rows = wave(40, 5);
         let white = rows.dot(&whitening(rows.view()).t());
         let matrix = to_nalgebra(rows.view());
-        let centred = DMatrix::from_fn(40, 5, |i, j| matrix[(i, j)] - matrix.column(j).mean());
-        let inverse = (centred.transpose() * &centred / 40.0)
+        let centered = DMatrix::from_fn(40, 5, |i, j| matrix[(i, j)] - matrix.column(j).mean());
+        let inverse = (centered.transpose() * &centered / 40.0)
             .try_inverse()
             .unwrap();
 

@@ -62,7 +62,7 @@ impl HoldOut {
     }
 
     /// Whether the frames directly before and after a tracked frame are mapped.
-    pub fn has_mapped_neighbours(self, frame: FrameId, frame_count: usize) -> bool {
+    pub fn has_mapped_neighbors(self, frame: FrameId, frame_count: usize) -> bool {
         match self {
             Self::Interleaved => true,
             Self::Blocks => !is_in_left_out_block(frame.row(), frame_count),

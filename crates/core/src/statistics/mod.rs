@@ -42,19 +42,19 @@ impl Rate {
         let count = n as f64;
         let rate = successes as f64 / n as f64;
         let spread = Z * (rate * (1.0 - rate) / count + Z * Z / (4.0 * count * count)).sqrt();
-        let centre = rate + Z * Z / (2.0 * count);
+        let center = rate + Z * Z / (2.0 * count);
         let scale = 1.0 + Z * Z / count;
 
         // Exact bounds at 0 and n, without rounding errors.
         let low = if successes == 0 {
             0.0
         } else {
-            (centre - spread) / scale
+            (center - spread) / scale
         };
         let high = if successes == n {
             1.0
         } else {
-            (centre + spread) / scale
+            (center + spread) / scale
         };
 
         Self { rate, low, high, n }
@@ -105,8 +105,8 @@ pub fn mean_of_known(values: &[f64]) -> f64 {
 
 /// Sample standard deviation, with n − 1 in the denominator.
 pub fn deviation(values: &[f64]) -> f64 {
-    let centre = mean(values);
-    let squares: f64 = values.iter().map(|value| (value - centre).powi(2)).sum();
+    let center = mean(values);
+    let squares: f64 = values.iter().map(|value| (value - center).powi(2)).sum();
     (squares / (values.len() as f64 - 1.0)).sqrt()
 }
 

@@ -148,8 +148,8 @@ impl TrainingPlan {
             }));
         }
 
-        if self.config.standardise && self.config.charts > 1 && self.config.mixing == Mixing::Gate {
-            return Err(Error::Adapter(adapter::Error::GatedStandardised));
+        if self.config.standardize && self.config.charts > 1 && self.config.mixing == Mixing::Gate {
+            return Err(Error::Adapter(adapter::Error::GatedStandardized));
         }
 
         Ok(())

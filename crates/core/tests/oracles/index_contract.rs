@@ -116,15 +116,15 @@ fn contract(build: Build, least_recall: f64) {
                 }
             }
 
-            let centre = truth[0].0;
-            let exclusion = Exclusion { centre, radius: 2 };
+            let center = truth[0].0;
+            let exclusion = Exclusion { center, radius: 2 };
             let kept = index.nearest(&query, 5, Some(exclusion));
 
-            assert!(kept.iter().all(|hit| hit.frame.0.abs_diff(centre.0) > 2));
+            assert!(kept.iter().all(|hit| hit.frame.0.abs_diff(center.0) > 2));
 
             let left = all
                 .iter()
-                .filter(|frame| frame.0.abs_diff(centre.0) > 2)
+                .filter(|frame| frame.0.abs_diff(center.0) > 2)
                 .count();
 
             assert_eq!(

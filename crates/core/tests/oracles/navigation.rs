@@ -470,7 +470,7 @@ fn every_step_of_every_mode_retrieves_the_oracles_frame(room: &str, folder: Path
                 let found = walk_pair(space, &navigator, *pair, plan);
                 let frames = found
                     .iter()
-                    .map(|step| f64::from(step.neighbours[0].frame.0));
+                    .map(|step| f64::from(step.neighbors[0].frame.0));
                 let frames: Vec<f64> = frames.collect();
                 let source = pair.source;
                 assert_eq!(

@@ -78,7 +78,7 @@ fn ridge_and_its_scores_match_scikit_learn(room: &str, folder: PathBuf) {
 
         let scale = seese3_core::adapter::TargetScale::of(&train_y);
         let targets =
-            Array2::from_shape_fn((train_y.len(), 6), |(r, c)| scale.normalised(train_y[r])[c]);
+            Array2::from_shape_fn((train_y.len(), 6), |(r, c)| scale.normalized(train_y[r])[c]);
         let fit = Ridge::fit(train_x.view(), targets.view(), 1.0, Intercept::Fitted).unwrap();
         let off = worst(
             &fit.coefficients,

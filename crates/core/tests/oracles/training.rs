@@ -1,4 +1,4 @@
-//! The adapter's network and its optimiser against PyTorch in f64, step by step.
+//! The adapter's network and its optimizer against PyTorch in f64, step by step.
 
 use std::path::{Path, PathBuf};
 
@@ -202,7 +202,7 @@ fn a_mixtures_gate_and_charts_match_pytorch(room: &str, folder: PathBuf) {
 
     for (row, y) in expected.rows("first.y").outer_iter().enumerate() {
         let motion = adapter.motion(from.row(row), to.row(row));
-        let seen = samples.scale().normalised(motion);
+        let seen = samples.scale().normalized(motion);
         let is_near = seen.iter().zip(y).all(|(a, b)| (a - b).abs() < 1e-12);
         assert!(is_near, "{room}, pair {row}");
     }
@@ -289,13 +289,13 @@ fn an_ensembles_members_are_adapters_learned_alone() {
 
     let refused = TrainConfig {
         charts: 2,
-        standardise: true,
+        standardize: true,
         ..alone
     };
 
     assert!(matches!(
         train(&samples, &refused, &Cancellation::default(), &mut |_| ()),
-        Err(Error::GatedStandardised)
+        Err(Error::GatedStandardized)
     ));
 }
 
@@ -325,11 +325,11 @@ fn weights_learned_on_z_scored_features_are_folded() {
 
     let expected = learned(&scored, &config).embed(scored.clone());
 
-    let standardised = TrainConfig {
-        standardise: true,
+    let standardized = TrainConfig {
+        standardize: true,
         ..config
     };
-    let folded = learned(&rows, &standardised).embed(rows);
+    let folded = learned(&rows, &standardized).embed(rows);
 
     let off = worst(&folded.mapv(f64::from), &expected.mapv(f64::from));
     assert!(off < 2e-3, "off by {off}");

@@ -1,7 +1,7 @@
 //! ARKitScenes: images `VIDEO/lowres_wide/VIDEO_TIME.png`, poses `VIDEO/lowres_wide.traj`.
 //!
 //! A line of the trajectory holds a time in seconds, a rotation vector (axis times angle, radians)
-//! and a translation (metres). This is the **world-to-camera** transform, which is inverted here.
+//! and a translation (meters). This is the **world-to-camera** transform, which is inverted here.
 //! About one image in six has a pose. As in the official loader, poses are looked up by their time
 //! rounded to milliseconds: an image takes the pose of its own millisecond, or else the nearest one
 //! less than 5 ms away.

@@ -42,8 +42,8 @@ struct Bundle {
     /// The format that the room was first read from.
     #[serde(default)]
     recorded_as: String,
-    #[serde(default)]
-    licence: String,
+    #[serde(default, alias = "licence")]
+    license: String,
     /// The folder that the image paths are relative to. If it is relative itself, it starts from
     /// the bundle's folder.
     #[serde(default)]
@@ -190,7 +190,7 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
         format,
         name,
         recorded_as,
-        licence,
+        license,
         images_root,
         numbered,
         names,
@@ -238,7 +238,7 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
     recording.stated = Stated {
         name,
         format: recorded_as,
-        licence,
+        license,
         camera,
     };
 
@@ -398,7 +398,7 @@ fn described(room: &Room, features: &[Features]) -> Bundle {
         format: FORMAT.to_owned(),
         name: room.id().to_string(),
         recorded_as: provenance.format.clone(),
-        licence: provenance.licence.clone(),
+        license: provenance.license.clone(),
         images_root: provenance.images_root.clone(),
         numbered: !frames.numbers.is_empty(),
         names: frames.names.clone(),

@@ -1,5 +1,5 @@
 //! KITTI odometry: a pose file with 12 numbers per line, the first three rows of
-//! `world_from_camera`, metres. Images are in a folder, sorted by the numbers in their names.
+//! `world_from_camera`, meters. Images are in a folder, sorted by the numbers in their names.
 //!
 //! The world frame is the camera of the first frame. The optional times are seconds, one per line.
 

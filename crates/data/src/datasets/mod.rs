@@ -168,7 +168,7 @@ pub struct Stated {
     /// The format that the room was first read from.
     pub format: String,
     /// The recording's license.
-    pub licence: String,
+    pub license: String,
     /// The camera of all images; `None` if unknown, or if images have different cameras.
     pub camera: Option<CameraIntrinsics>,
 }

@@ -1,5 +1,5 @@
 //! ScanNet scenes as written by its exporter: `color/N.jpg` and `pose/N.txt`, or all files in one
-//! folder; camera-to-world, metres.
+//! folder; camera-to-world, meters.
 //!
 //! Frames are ordered by number, not by name: 2 comes before 10. Lost tracking is written as −inf,
 //! and by one exporter as an identity matrix.

@@ -1,4 +1,4 @@
-//! ScanNet's `.sens`: one file with color and depth images and camera-to-world poses, metres,
+//! ScanNet's `.sens`: one file with color and depth images and camera-to-world poses, meters,
 //! little-endian.
 //!
 //! ```text
@@ -140,10 +140,10 @@ impl<'a> Sens<'a> {
 
         self.skip(name, "its name")?;
         self.skip(4 * MATRIX_BYTES, "its calibration")?;
-        let colour = i32::from_le_bytes(self.array("its colour compression")?);
-        if !matches!(colour, 1 | 2) {
+        let color = i32::from_le_bytes(self.array("its color compression")?);
+        if !matches!(color, 1 | 2) {
             let problem =
-                format!("stores colour in format {colour}; only PNG (1) and JPEG (2) are read");
+                format!("stores color in format {color}; only PNG (1) and JPEG (2) are read");
             return Err(self.malformed(problem.into()));
         }
 

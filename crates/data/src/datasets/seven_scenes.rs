@@ -1,4 +1,4 @@
-//! 7-Scenes: `SCENE/seq-XX/frame-XXXXXX.{color.*,pose.txt}`, poses camera-to-world, metres.
+//! 7-Scenes: `SCENE/seq-XX/frame-XXXXXX.{color.*,pose.txt}`, poses camera-to-world, meters.
 //!
 //! - The published poses are those of the depth sensor. They are used as poses of the color camera,
 //!   as by most users of the data set, unless a calibration is given.
@@ -19,7 +19,7 @@ use seese3_core::geometry::{Pose, pose_from_matrix};
 pub struct SevenScenes {
     /// A single sequence, for instance `seq-01`; all of them if `None`.
     pub sequence: Option<String>,
-    /// A text file with the 4×4 matrix `rgb_from_depth`, metres. If it is given, the poses become
+    /// A text file with the 4×4 matrix `rgb_from_depth`, meters. If it is given, the poses become
     /// those of the color camera.
     pub rgb_from_depth: Option<PathBuf>,
 }
@@ -266,7 +266,7 @@ fn calibration(file: &Path) -> Result<Pose, Error> {
     let matrix = read_matrix(file)?.map_err(|reason| malformed(reason.into()))?;
 
     let (rgb_from_depth, _) = pose_from_matrix(&matrix).map_err(|_| {
-        malformed("is not a rigid transform; expected rgb_from_depth, 4×4, metres".into())
+        malformed("is not a rigid transform; expected rgb_from_depth, 4×4, meters".into())
     })?;
     Ok(rgb_from_depth.inverse())
 }

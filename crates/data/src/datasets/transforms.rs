@@ -2,7 +2,7 @@
 //! with OpenGL axes; it is converted to x right, y down, z forward.
 //!
 //! Translations have the unit of the program that wrote the file; COLMAP's unit is arbitrary, not
-//! metres. Frames are sorted by the numbers in their names, because the file often is unsorted.
+//! meters. Frames are sorted by the numbers in their names, because the file often is unsorted.
 
 use std::path::{Path, PathBuf};
 

@@ -1,5 +1,5 @@
 //! 12-Scenes: `HOUSE/ROOM/{info.txt,split.txt,data/frame-XXXXXX.{color.jpg,pose.txt}}`,
-//! camera-to-world, metres.
+//! camera-to-world, meters.
 //!
 //! - The pose file of a frame without tracking contains the text INF.
 //! - `split.txt` has one line per sequence, `sequenceK [frames=N] …`; the first sequence is held

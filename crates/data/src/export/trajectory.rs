@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use seese3_core::geometry::Pose;
 
-/// TUM format: one line per frame, "timestamp tx ty tz qx qy qz qw", seconds and metres,
+/// TUM format: one line per frame, "timestamp tx ty tz qx qy qz qw", seconds and meters,
 /// `world_from_camera`.
 ///
 /// There must be as many timestamps as poses.
@@ -34,7 +34,7 @@ pub fn tum_trajectory(timestamps_ns: &[i64], poses: &[Pose]) -> String {
 }
 
 /// KITTI format: one line per frame, the first three rows of `world_from_camera` as a matrix, row
-/// by row, metres.
+/// by row, meters.
 pub fn kitti_trajectory(poses: &[Pose]) -> String {
     let mut text = String::new();
     for pose in poses {

@@ -12,17 +12,17 @@ const JUMP: f64 = 10.0;
 const FEWEST_STEPS: usize = 40;
 /// Maximum plausible median speed of a camera, m/s. Above it, the unit of length is wrong.
 const FASTEST_M_S: f64 = 50.0;
-/// Maximum plausible median step of a recording without timestamps, metres.
+/// Maximum plausible median step of a recording without timestamps, meters.
 const LONGEST_STEP_M: f64 = 10.0;
 
 /// Statistics of a camera's path.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PathFacts {
-    /// The size of the box around all camera positions, along the world's axes, metres.
+    /// The size of the box around all camera positions, along the world's axes, meters.
     pub extent_m: [f64; 3],
-    /// The length of the path, metres, without the gaps between sequences.
+    /// The length of the path, meters, without the gaps between sequences.
     pub length_m: f64,
-    /// The median distance between consecutive frames, metres.
+    /// The median distance between consecutive frames, meters.
     pub median_step_m: f64,
     /// The largest of these distances, and the later of its two frames.
     pub largest_step_m: (f64, FrameId),
@@ -58,9 +58,9 @@ pub enum PathWarning {
         /// The frame after the first jump.
         first: FrameId,
     },
-    /// Steps are so long that the translations are likely not in metres.
+    /// Steps are so long that the translations are likely not in meters.
     OtherUnit {
-        /// The median step, metres.
+        /// The median step, meters.
         median_step_m: f64,
     },
     /// Times do not increase from frame to frame.
@@ -73,7 +73,7 @@ pub enum PathWarning {
 /// A step between consecutive frames of one sequence.
 struct Step {
     to: FrameId,
-    metres: f64,
+    meters: f64,
     radians: f64,
     seconds: Option<f64>,
 }
@@ -82,7 +82,7 @@ impl PathFacts {
     /// The statistics of a room's poses. `None` if no two frames are consecutive.
     pub fn of(room: &Room) -> Option<Self> {
         let steps = steps(room);
-        let metres: Vec<f64> = steps.iter().map(|step| step.metres).collect();
+        let meters: Vec<f64> = steps.iter().map(|step| step.meters).collect();
         let radians: Vec<f64> = steps.iter().map(|step| step.radians).collect();
         let seconds: Vec<f64> = steps.iter().filter_map(|step| step.seconds).collect();
 
@@ -97,9 +97,9 @@ impl PathFacts {
 
         Some(Self {
             extent_m: Vector3::from(high - low).into(),
-            length_m: metres.iter().sum(),
-            median_step_m: median(&metres),
-            largest_step_m: longest(|step| step.metres)?,
+            length_m: meters.iter().sum(),
+            median_step_m: median(&meters),
+            largest_step_m: longest(|step| step.meters)?,
             median_step_rad: median(&radians),
             largest_step_rad: longest(|step| step.radians)?,
             rate_hz: rate_hz.filter(|rate| rate.is_finite() && *rate > 0.0),
@@ -119,7 +119,7 @@ fn steps(room: &Room) -> Vec<Step> {
         let elapsed = times.get(to.row()).zip(times.get(from.row()));
         Step {
             to,
-            metres: (b.translation.vector - a.translation.vector).norm(),
+            meters: (b.translation.vector - a.translation.vector).norm(),
             radians: a.rotation.angle_to(&b.rotation),
             seconds: elapsed.map(|(later, earlier)| (*later as f64 - *earlier as f64) * 1e-9),
         }
@@ -142,7 +142,7 @@ fn warnings(room: &Room, steps: &[Step]) -> Vec<PathWarning> {
     }
 
     let mut warnings = Vec::new();
-    if steps.iter().all(|step| step.metres == 0.0) && !steps.is_empty() {
+    if steps.iter().all(|step| step.meters == 0.0) && !steps.is_empty() {
         warnings.push(PathWarning::OnlyTurns);
     }
 
@@ -159,12 +159,12 @@ fn warnings(room: &Room, steps: &[Step]) -> Vec<PathWarning> {
         });
     }
 
-    let metres: Vec<f64> = steps.iter().map(|step| step.metres).collect();
+    let meters: Vec<f64> = steps.iter().map(|step| step.meters).collect();
     let radians: Vec<f64> = steps.iter().map(|step| step.radians).collect();
     let long = |values: &[f64]| quantile(values, 0.95).unwrap_or(f64::INFINITY);
-    let [long_m, long_rad] = [long(&metres), long(&radians)];
+    let [long_m, long_rad] = [long(&meters), long(&radians)];
     let is_jump = |step: &&Step| {
-        let is_far = long_m > 0.0 && step.metres > JUMP * long_m;
+        let is_far = long_m > 0.0 && step.meters > JUMP * long_m;
         is_far || (long_rad > 0.0 && step.radians > JUMP * long_rad)
     };
     let jumps: Vec<&Step> = steps.iter().filter(is_jump).collect();
@@ -177,9 +177,9 @@ fn warnings(room: &Room, steps: &[Step]) -> Vec<PathWarning> {
 
     let speeds: Vec<f64> = steps
         .iter()
-        .filter_map(|step| Some(step.metres / step.seconds?))
+        .filter_map(|step| Some(step.meters / step.seconds?))
         .collect();
-    let median_step_m = median(&metres);
+    let median_step_m = median(&meters);
     let is_too_fast = match speeds.is_empty() {
         true => median_step_m > LONGEST_STEP_M,
         false => median(&speeds) > FASTEST_M_S,

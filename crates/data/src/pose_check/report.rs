@@ -13,7 +13,7 @@ use seese3_core::geometry::{CameraIntrinsics, Pose};
 use seese3_core::image::RgbImage;
 use seese3_core::room::{FrameId, Room};
 
-/// Usual distance of visible surfaces, metres. A fitted depth outside of it suggests another unit
+/// Usual distance of visible surfaces, meters. A fitted depth outside of it suggests another unit
 /// of length.
 const USUAL_DEPTH_M: std::ops::Range<f64> = 0.4..40.0;
 /// Largest factor between the stated and the fitted focal length without a warning.
@@ -64,13 +64,13 @@ pub struct ImageReport {
     pub is_all_lost: bool,
 }
 
-/// Unit of length that the translations may be in instead of metres.
+/// Unit of length that the translations may be in instead of meters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LengthUnit {
     /// 0.001 m.
-    Millimetres,
+    Millimeters,
     /// 0.01 m.
-    Centimetres,
+    Centimeters,
     /// Any other, such as the arbitrary one of COLMAP.
     Unknown,
 }
@@ -101,7 +101,7 @@ pub enum PoseWarning {
     },
     /// Visible surfaces would be implausibly near or far.
     Depth {
-        /// Their fitted distance, metres.
+        /// Their fitted distance, meters.
         depth_m: f64,
         /// The unit that would explain it.
         unit: LengthUnit,
@@ -303,9 +303,9 @@ fn observe(room: &Room, images: &RoomImages<'_>) -> Vec<ObservedPair> {
 fn depth_warning(seen: SceneEstimate) -> Option<PoseWarning> {
     let depth_m = seen.depth.filter(|depth| !USUAL_DEPTH_M.contains(depth))?;
     let unit = if USUAL_DEPTH_M.contains(&(depth_m / 1_000.0)) && depth_m > 500.0 {
-        LengthUnit::Millimetres
+        LengthUnit::Millimeters
     } else if USUAL_DEPTH_M.contains(&(depth_m / 100.0)) {
-        LengthUnit::Centimetres
+        LengthUnit::Centimeters
     } else {
         LengthUnit::Unknown
     };
@@ -379,8 +379,8 @@ impl fmt::Display for PathWarning {
             }
             Self::OtherUnit { median_step_m } => write!(
                 f,
-                "the median step is {median_step_m:.1} m: are the translations in millimetres or \
-                 centimetres?"
+                "the median step is {median_step_m:.1} m: are the translations in millimeters or \
+                 centimeters?"
             ),
             Self::TimesFall { first } => write!(
                 f,
@@ -419,9 +419,9 @@ impl fmt::Display for PoseWarning {
             }
             Self::Depth { depth_m, unit } => {
                 let unit = match unit {
-                    LengthUnit::Millimetres => "are the translations in millimetres?",
-                    LengthUnit::Centimetres => "are the translations in centimetres?",
-                    LengthUnit::Unknown => "are the translations in metres? COLMAP's are not",
+                    LengthUnit::Millimeters => "are the translations in millimeters?",
+                    LengthUnit::Centimeters => "are the translations in centimeters?",
+                    LengthUnit::Unknown => "are the translations in meters? COLMAP's are not",
                 };
                 write!(f, "things in view would be {depth_m:.2} m away: {unit}")
             }

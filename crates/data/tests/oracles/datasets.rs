@@ -212,7 +212,7 @@ fn seven_scenes_keeps_sequences_and_the_split() {
 
 /// Oracle: the published poses times the inverse of a made-up calibration, by NumPy.
 #[test]
-fn seven_scenes_poses_can_be_those_of_the_colour_camera() {
+fn seven_scenes_poses_can_be_those_of_the_color_camera() {
     let expected = expected("sevenscenes");
     let file = tempfile::NamedTempFile::new().unwrap();
 
@@ -352,7 +352,7 @@ fn hostile_sens_files_are_refused() {
     for (at, what) in [
         (4, "the name"),
         (header, "the frames"),
-        (header + 8 + 64 + 16, "the colour image"),
+        (header + 8 + 64 + 16, "the color image"),
     ] {
         let mut altered = bytes.clone();
         altered[at..at + 8].copy_from_slice(&u64::MAX.to_le_bytes());
@@ -386,7 +386,7 @@ fn exported(out: &Path) -> (Room, Features) {
 
     let provenance = Provenance {
         format: "scannet".to_owned(),
-        licence: "test only".to_owned(),
+        license: "test only".to_owned(),
         images_root: found.images_root.clone(),
         worst_rotation_deviation: found.worst_rotation_deviation,
         camera: Some(
@@ -506,7 +506,7 @@ fn an_exported_room_comes_back_whole() {
     assert_eq!(back.features[0].source(), features.source());
 
     assert_eq!(
-        (back.stated.name.as_str(), back.stated.licence.as_str()),
+        (back.stated.name.as_str(), back.stated.license.as_str()),
         ("tiny", "test only")
     );
 

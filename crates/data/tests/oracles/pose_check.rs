@@ -14,7 +14,7 @@ use seese3_data::pose_check::{
 /// The focal length of the camera, image widths.
 const FOCAL: f64 = 0.8;
 
-/// A camera that looks about in a room of some metres.
+/// A camera that looks about in a room of some meters.
 fn path() -> Vec<Pose> {
     let wave = |t: f64, period: f64, phase: f64| (t / period + phase).sin();
     let pose = |row: u32| {
@@ -35,7 +35,7 @@ fn path() -> Vec<Pose> {
 }
 
 /// How the image moves between two poses: the similarity that fits best, by least squares, to where
-/// a pinhole camera sees points about three metres before it. It knows nothing of twists. `right`
+/// a pinhole camera sees points about three meters before it. It knows nothing of twists. `right`
 /// is 1, or -1 in an image that is mirrored.
 fn seen(first: &Pose, second: &Pose, right: f64, random: &mut ChaCha8Rng) -> ImageMotion {
     let mut moment = Matrix4::zeros();
@@ -156,7 +156,7 @@ fn other_mistakes_are_named() {
         changed.collect()
     };
 
-    // Millimetres: the scene is three kilometres away.
+    // Millimeters: the scene is three kilometers away.
     let large = with(&|pose| pose.translation.vector * 1_000.0);
     let Verdict::Agrees(seen) = verdict(&large) else {
         panic!();
@@ -243,7 +243,7 @@ fn other_mistakes_are_named() {
     assert_eq!(nothing(&still), Verdict::Unrelated { explained: 0.0 });
 }
 
-/// Oracle: the exchange that was made. The camera moves two metres along x, and half a metre along
+/// Oracle: the exchange that was made. The camera moves two meters along x, and half a meter along
 /// the axes that are exchanged.
 #[test]
 fn an_exchange_of_axes_that_hardly_matter_is_named() {

@@ -9,7 +9,7 @@ use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
 use seese3_encoder::{
     Bounds, Encoder, Error, Filter, Layer, ModelTask, Preparation, Resize, Runtime, RuntimeKind,
-    decode, normalised, read_image, recipe,
+    decode, normalized, read_image, recipe,
 };
 use seese3_testing::{Tensors, golden, json, npy, number, shared};
 
@@ -49,7 +49,7 @@ fn layer(name: &str, pooling: &str) -> Layer {
     }
 }
 
-fn centred() -> Preparation {
+fn centered() -> Preparation {
     Preparation {
         divisor: 255.0,
         mean: [0.5; 3],
@@ -64,7 +64,7 @@ fn tiny(file: &str, layers: Vec<Layer>, window: usize) -> ModelTask {
             width: 8,
             height: 6,
         },
-        ..centred()
+        ..centered()
     };
 
     ModelTask {
@@ -238,7 +238,7 @@ fn models_that_cannot_be_used_are_refused_by_name() {
                 width: 9,
                 height: 6,
             },
-            ..centred()
+            ..centered()
         });
         let no_divisor = with(Preparation {
             divisor: 0.0,
@@ -664,11 +664,11 @@ fn the_keypoints_of_an_image_are_those_of_numpy() {
     }
 }
 
-/// Oracle: the tensors that Pillow and NumPy made of the same 8-bit images; the normalisation is
+/// Oracle: the tensors that Pillow and NumPy made of the same 8-bit images; the normalization is
 /// exact to an f32.
 #[test]
 #[ignore = "needs the folder of large inputs: SEESE3_SHARED or ../shared"]
-fn normalised_tensors_are_numpys() {
+fn normalized_tensors_are_numpys() {
     let folder = shared().join("models");
     for model in real_models() {
         let images = stack(&folder.join("inputs").join(model.inputs));
@@ -677,7 +677,7 @@ fn normalised_tensors_are_numpys() {
 
         // Rows 0 and 8 are frames 0 and 533.
         for row in [0, 8] {
-            normalised(&model.preparation, &images[row], &mut numbers);
+            normalized(&model.preparation, &images[row], &mut numbers);
         }
 
         let found = ArrayD::from_shape_vec(expected.shape().to_vec(), numbers).unwrap();

@@ -196,7 +196,7 @@ fn settings(plan: &TrainingPlan) -> String {
         charts,
         mixing,
         loss,
-        standardise,
+        standardize,
         noise,
         average,
         through_zero,
@@ -208,7 +208,7 @@ fn settings(plan: &TrainingPlan) -> String {
         "preset={} split={} stride={stride} pairs=[{}] epochs={epochs} least_steps={least_steps} batch={batch} \
          learning_rate={learning_rate:e} weight_decay={weight_decay:e} clip_norm={clip_norm:e} \
          hidden={hidden} geo_dim={latent} charts={charts} mixing={} loss={} \
-         standardise={standardise} noise={noise:e} average={average:e} \
+         standardise={standardize} noise={noise:e} average={average:e} \
          through_zero={through_zero} seed={seed} correctors=[{}]",
         preset.name(),
         split.name(),

@@ -296,7 +296,7 @@ fn outcome(
         candidate_count: report.candidate_count,
         baselines: Baselines::of(
             adapter.scale(),
-            record.optimiser_steps(),
+            record.optimizer_steps(),
             &room,
             &TestPairs {
                 split: protocol.split,
@@ -418,7 +418,7 @@ mod tests {
                 constant_r2: 0.0,
                 variance_ratio: 1.0,
                 nearest_pose: None,
-                optimiser_steps: 1,
+                optimizer_steps: 1,
             },
         };
         let won = wins(&[outcome(5, 4), outcome(3, 4), outcome(4, 4)], "ours").unwrap();

@@ -91,11 +91,11 @@ impl FoldedBaselines {
         room: &Room,
         splits: &[Split],
         stride: u32,
-        optimiser_steps: u64,
+        optimizer_steps: u64,
         constant_r2: f64,
     ) -> Result<Self, splits::Error> {
         let within =
-            |&split: &Split| Baselines::within(room, &TestPairs { split, stride }, optimiser_steps);
+            |&split: &Split| Baselines::within(room, &TestPairs { split, stride }, optimizer_steps);
         let by_split: Vec<Baselines> = splits.iter().map(within).collect::<Result<_, _>>()?;
 
         let ratios: Vec<f64> = by_split.iter().map(|split| split.variance_ratio).collect();
@@ -114,7 +114,7 @@ impl FoldedBaselines {
                     translation_m: mean(|pose| pose.translation_m),
                     rotation_rad: mean(|pose| pose.rotation_rad),
                 }),
-                optimiser_steps,
+                optimizer_steps,
             },
             by_split,
         })

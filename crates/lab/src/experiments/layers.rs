@@ -16,7 +16,7 @@ use crate::probes::{Duplicates, MutualKnn, intrinsic_dimension, mutual_knn, ridg
 /// Settings of a row, besides its room and features.
 #[derive(Debug, Clone)]
 pub struct LayerProtocol {
-    /// How M1 compares neighbours.
+    /// How M1 compares neighbors.
     pub mutual_knn: MutualKnn,
     /// Frames before and after each frame that M2 excludes as neighbors.
     pub gap: usize,

@@ -79,7 +79,7 @@ impl ErrorQuantiles {
 /// Errors of estimated poses or motions.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct LocalizationErrors {
-    /// Translation errors, metres.
+    /// Translation errors, meters.
     pub translation_m: ErrorQuantiles,
     /// Rotation errors, degrees.
     pub rotation_deg: ErrorQuantiles,
@@ -110,7 +110,7 @@ pub struct Localization {
     pub ours: LocalizationErrors,
     /// The pose of the mapped frame with the nearest feature.
     pub nearest_frame: LocalizationErrors,
-    /// The pose of the mapped frame with the nearest true pose, by metres plus radians: about the
+    /// The pose of the mapped frame with the nearest true pose, by meters plus radians: about the
     /// best that retrieval alone can reach.
     pub nearest_pose: LocalizationErrors,
     /// The given adapter's full estimate relative to the nearest frame.
@@ -267,7 +267,7 @@ fn by_rules(
     (LocalizationErrors::of(&errors), scores)
 }
 
-/// Errors of the mapped frames with the nearest true poses, by metres plus radians.
+/// Errors of the mapped frames with the nearest true poses, by meters plus radians.
 fn nearest_poses(views: &[View<'_>], mapped: &[FrameId], poses: &[Pose]) -> LocalizationErrors {
     let nearest = |view: &View<'_>| {
         mapped

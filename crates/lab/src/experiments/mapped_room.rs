@@ -24,7 +24,7 @@ pub struct PlanningProtocol {
     pub hold_out: HoldOut,
     /// Number of queries per room.
     pub questions: usize,
-    /// The longest hop, ‖(v, ω)‖ with metres and radians mixed. `None` uses the adapter's own,
+    /// The longest hop, ‖(v, ω)‖ with meters and radians mixed. `None` uses the adapter's own,
     /// which the pose-graph planners exceed if there is no other path.
     pub longest_hop: Option<f64>,
     /// Seed of the random queries.

@@ -107,13 +107,13 @@ pub fn squared_errors(motions: &[MotionSurprise]) -> Vec<f64> {
 /// poses.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct PathErrors {
-    /// Absolute translation errors, metres.
+    /// Absolute translation errors, meters.
     #[serde(rename = "ape_translation_rmse_m")]
     pub ape_m: BothPaths,
     /// Absolute rotation errors, radians.
     #[serde(rename = "ape_rotation_rmse_rad")]
     pub ape_rad: BothPaths,
-    /// Relative translation errors over one frame, metres.
+    /// Relative translation errors over one frame, meters.
     #[serde(rename = "rpe_translation_rmse_m")]
     pub rpe_m: BothPaths,
 }
@@ -134,12 +134,12 @@ pub struct UnknownStart {
     #[serde(rename = "lost_without_initial_pose")]
     pub lost: f64,
     /// Number of frames until the tracker was TRACKING near the true pose; `None` if it never was.
-    pub frames_to_relocalise: Option<usize>,
+    pub frames_to_relocalize: Option<usize>,
 }
 
 /// Results of relocalizing single views among several rooms.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub struct Relocalisation {
+pub struct Relocalization {
     /// Number of candidate rooms.
     pub rooms: usize,
     /// Number of views located in the right room.
@@ -150,10 +150,10 @@ pub struct Relocalisation {
     pub ambiguous: usize,
     /// Number of views located in some room when the right room was not among the candidates.
     pub named_without_own: usize,
-    /// Translation errors of the poses in the right room, metres; in JSON, their root mean square.
+    /// Translation errors of the poses in the right room, meters; in JSON, their root mean square.
     #[serde(rename = "pose_m", serialize_with = "rms")]
     pub pose_errors_m: Vec<f64>,
-    /// Translation errors of the nearest frames' poses, metres.
+    /// Translation errors of the nearest frames' poses, meters.
     #[serde(rename = "nearest_frame_m", serialize_with = "rms")]
     pub nearest_errors_m: Vec<f64>,
     /// Squared Mahalanobis lengths of the pose errors in the right room.
@@ -187,7 +187,7 @@ pub fn evaluate<'a>(
 ///
 /// # Errors
 /// [`Error`] when a view cannot be matched.
-pub fn relocalisation(rooms: &[TrackedRoom<'_>]) -> Result<Relocalisation, Error> {
+pub fn relocalization(rooms: &[TrackedRoom<'_>]) -> Result<Relocalization, Error> {
     let maps: Vec<Arc<Map>> = rooms
         .iter()
         .filter_map(|room| room.map().cloned())
@@ -197,7 +197,7 @@ pub fn relocalisation(rooms: &[TrackedRoom<'_>]) -> Result<Relocalisation, Error
         let mut others = maps.clone();
         let own = others.remove(place);
         let latents = own.navigator().latents();
-        let mut found = Relocalisation::default();
+        let mut found = Relocalization::default();
 
         for frame in room.tracked().iter().step_by(RELOCALISED_STEP) {
             let feature = room.features().row(frame.row()).to_vec();
@@ -225,15 +225,15 @@ pub fn relocalisation(rooms: &[TrackedRoom<'_>]) -> Result<Relocalisation, Error
         Ok(found)
     };
 
-    let by_room: Vec<Relocalisation> = rooms
+    let by_room: Vec<Relocalization> = rooms
         .par_iter()
         .enumerate()
         .map(of_room)
         .collect::<Result<_, Error>>()?;
-    let sum = |of: fn(&Relocalisation) -> usize| by_room.iter().map(of).sum();
-    let all = |of: fn(&Relocalisation) -> &Vec<f64>| by_room.iter().flat_map(of).copied().collect();
+    let sum = |of: fn(&Relocalization) -> usize| by_room.iter().map(of).sum();
+    let all = |of: fn(&Relocalization) -> &Vec<f64>| by_room.iter().flat_map(of).copied().collect();
 
-    Ok(Relocalisation {
+    Ok(Relocalization {
         right: sum(|found| found.right),
         wrong: sum(|found| found.wrong),
         ambiguous: sum(|found| found.ambiguous),
@@ -245,7 +245,7 @@ pub fn relocalisation(rooms: &[TrackedRoom<'_>]) -> Result<Relocalisation, Error
     })
 }
 
-impl Relocalisation {
+impl Relocalization {
     /// Adds the pose errors of a view that was located in the right room.
     fn add_pose(&mut self, matched: &MapMatch, room: &TrackedRoom<'_>, frame: FrameId) {
         let poses = room.room().poses();
@@ -284,8 +284,8 @@ fn room_odometry<'a>(
     };
 
     let tracked = tracked_room.tracked();
-    let has_mapped_neighbours =
-        |row: usize| hold_out.has_mapped_neighbours(tracked[row], frame_count);
+    let has_mapped_neighbors =
+        |row: usize| hold_out.has_mapped_neighbors(tracked[row], frame_count);
 
     let streams = tracked_room.streams();
     let example = streams.first().and_then(|stream| stream.views.first());
@@ -308,14 +308,14 @@ fn room_odometry<'a>(
             rpe_m: both(2),
         },
         map_poses: MapPoseErrors {
-            mapped: own.map_pose_surprises_where(has_mapped_neighbours),
-            unmapped: own.map_pose_surprises_where(|row| !has_mapped_neighbours(row)),
+            mapped: own.map_pose_surprises_where(has_mapped_neighbors),
+            unmapped: own.map_pose_surprises_where(|row| !has_mapped_neighbors(row)),
         },
         motions: own.motion_surprises(),
         statuses: StatusShares::of(|status| own.share(status)),
         unknown_start: UnknownStart {
             lost: unknown.share(Status::Lost),
-            frames_to_relocalise: unknown.frames_to_relocalise(),
+            frames_to_relocalize: unknown.frames_to_relocalize(),
         },
         other_rooms: [false, true].map(|is_after_own| tracked_room.lost_frames(all, is_after_own)),
         scenarios,

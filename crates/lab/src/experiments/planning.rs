@@ -80,7 +80,7 @@ pub struct PlannerScores {
     pub expected_there: f64,
     /// Total number of hops in the queries counted in `truly_there`.
     pub steps: usize,
-    /// The longest hop, ‖(v, ω)‖ with metres and radians mixed.
+    /// The longest hop, ‖(v, ω)‖ with meters and radians mixed.
     pub longest_hop: f64,
     /// Number of queries with views of other rooms.
     pub other_questions: usize,
@@ -121,7 +121,7 @@ pub struct RoomPlanning {
     pub room: String,
     /// Number of mapped frames.
     pub mapped_frames: usize,
-    /// The longest allowed hop, ‖(v, ω)‖ with metres and radians mixed.
+    /// The longest allowed hop, ‖(v, ω)‖ with meters and radians mixed.
     #[serde(rename = "allowed_hop")]
     pub longest_hop: f64,
     /// Scores by planner.

@@ -24,9 +24,9 @@ use crate::probes::{
 /// Which scores are computed; `None` or an empty list skips a score.
 #[derive(Debug, Clone)]
 pub struct ProbeProtocol {
-    /// How M1 compares neighbours.
+    /// How M1 compares neighbors.
     pub m1: Option<MutualKnn>,
-    /// How M2 treats neighbours in time and repeated rows.
+    /// How M2 treats neighbors in time and repeated rows.
     pub m2: Option<DimensionProtocol>,
     /// Plans of M3, of which only the stride is used.
     pub m3: Vec<TrainingPlan>,
@@ -99,13 +99,13 @@ impl AtStride {
         room: Option<&Room>,
         splits: &[Split],
         stride: u32,
-        optimiser_steps: u64,
+        optimizer_steps: u64,
         runs: &[FoldedMotions],
     ) -> Result<Self, Error> {
         // The constant is the same for every seed.
         let constant = runs.first().map_or(f64::NAN, FoldedMotions::constant_r2);
         let baselines = room
-            .map(|room| FoldedBaselines::of(room, splits, stride, optimiser_steps, constant))
+            .map(|room| FoldedBaselines::of(room, splits, stride, optimizer_steps, constant))
             .transpose()?;
 
         let by_seed: Vec<Vec<f64>> = runs.iter().map(FoldedMotions::r2_by_split).collect();
@@ -141,7 +141,7 @@ pub struct MutualKnnScore {
     /// Mean fraction of feature neighbors that are also pose neighbors, 0 to 1.
     #[serde(rename = "value")]
     pub share: f64,
-    /// How the neighbours were compared.
+    /// How the neighbors were compared.
     #[serde(flatten)]
     pub options: MutualKnn,
 }

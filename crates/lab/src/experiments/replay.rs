@@ -184,7 +184,7 @@ impl Replay {
 
     /// Number of frames until the tracker was TRACKING within 0.5 m and 15° of the truth; `None` if
     /// it never was.
-    pub fn frames_to_relocalise(&self) -> Option<usize> {
+    pub fn frames_to_relocalize(&self) -> Option<usize> {
         let is_found = |(update, truth): (&Update, &Pose)| {
             let Some(map_pose) = &update.map_pose else {
                 return false;

@@ -12,7 +12,7 @@ use super::replay::Replay;
 
 use crate::json;
 
-/// Translation error above which a pose counts as wrong, metres.
+/// Translation error above which a pose counts as wrong, meters.
 const WRONG_BEYOND_M: f64 = 0.2;
 /// Rotation error above which a pose counts as wrong, degrees.
 const WRONG_BEYOND_DEG: f64 = 10.0;
@@ -20,7 +20,7 @@ const WRONG_BEYOND_DEG: f64 = 10.0;
 /// The scores of one replay, or of several rooms together.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TrackingScores {
-    /// Absolute position errors over the frames with a map pose, metres.
+    /// Absolute position errors over the frames with a map pose, meters.
     #[serde(rename = "ape_m")]
     pub ape: AnswerErrors,
     /// Absolute rotation errors over the same frames, radians.
@@ -143,7 +143,7 @@ pub struct AnswerErrors {
     pub standing_still: f64,
 }
 
-/// Root-mean-square velocity errors over frames, metres per second.
+/// Root-mean-square velocity errors over frames, meters per second.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct VelocityErrors {
     /// Error of the reported velocity.

@@ -27,9 +27,9 @@ impl<T: Real> DifferenceInput<T> {
     /// z-scoring of the training targets.
     pub fn motions(&self, features: [ArrayView2<'_, f32>; 2], scale: &TargetScale) -> Vec<Twist> {
         let [from, to] = features.map(|rows| rows.mapv(|x| T::of(f64::from(x))));
-        let normalised = self.0.embed(to - from).dot(&self.0.motion_matrix().t());
+        let normalized = self.0.embed(to - from).dot(&self.0.motion_matrix().t());
 
-        normalised
+        normalized
             .outer_iter()
             .map(|row| scale.twist(&Vector6::from_fn(|c, _| row[c].f64())))
             .collect()

@@ -75,13 +75,13 @@ pub fn train_formulation(
     let plain = TrainConfig::default();
 
     let TrainConfig {
-        standardise,
+        standardize,
         charts,
         loss,
         ..
     } = plan.config;
 
-    if (standardise, charts, loss) != (plain.standardise, plain.charts, plain.loss) {
+    if (standardize, charts, loss) != (plain.standardize, plain.charts, plain.loss) {
         return Err(training::Error::NotPlain);
     }
 
@@ -168,7 +168,7 @@ pub fn read_by_adapter(
 
     Ok((
         read.collect::<Result<_, training::Error>>()?,
-        record.optimiser_steps(),
+        record.optimizer_steps(),
     ))
 }
 

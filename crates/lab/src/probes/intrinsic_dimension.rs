@@ -11,7 +11,7 @@ use super::Error;
 use seese3_core::statistics::{mean, median};
 
 /// Number of neighbors K of the maximum-likelihood estimate.
-const MLE_NEIGHBOURS: usize = 20;
+const MLE_NEIGHBORS: usize = 20;
 /// Fraction of the largest ratios that TwoNN discards.
 const DISCARDED: f64 = 0.1;
 
@@ -112,17 +112,17 @@ pub fn intrinsic_dimension(
             })
             .collect();
 
-        if squares.len() < MLE_NEIGHBOURS {
+        if squares.len() < MLE_NEIGHBORS {
             return Err(Error::TooFewCandidates {
                 frame: kept[row],
-                k: MLE_NEIGHBOURS,
+                k: MLE_NEIGHBORS,
                 exclusion: gap,
             });
         }
 
         // Select the K nearest in linear time, then sort only these.
-        squares.select_nth_unstable_by(MLE_NEIGHBOURS - 1, f64::total_cmp);
-        squares.truncate(MLE_NEIGHBOURS);
+        squares.select_nth_unstable_by(MLE_NEIGHBORS - 1, f64::total_cmp);
+        squares.truncate(MLE_NEIGHBORS);
         squares.sort_by(f64::total_cmp);
 
         Ok(squares.into_iter().map(f64::sqrt).collect())
@@ -136,18 +136,18 @@ pub fn intrinsic_dimension(
     // Drop rows at distance zero to another row: the estimators divide by the nearest distance.
     let usable: Vec<&Vec<f64>> = distances.iter().filter(|row| row[0] > 0.0).collect();
 
-    if usable.len() <= MLE_NEIGHBOURS {
+    if usable.len() <= MLE_NEIGHBORS {
         return Err(Error::TooFewRows {
             kept: usable.len(),
             rows: all.nrows(),
-            needed: MLE_NEIGHBOURS + 1,
+            needed: MLE_NEIGHBORS + 1,
         });
     }
 
     Ok(IntrinsicDimension {
         two_nn: two_nn(&usable),
-        mle_biased: mle(&usable, MLE_NEIGHBOURS as f64 - 1.0),
-        mle_unbiased: mle(&usable, MLE_NEIGHBOURS as f64 - 2.0),
+        mle_biased: mle(&usable, MLE_NEIGHBORS as f64 - 1.0),
+        mle_unbiased: mle(&usable, MLE_NEIGHBORS as f64 - 2.0),
         used: usable.len(),
         dropped: all.nrows() - usable.len(),
     })

@@ -82,7 +82,7 @@ impl Default for MutualKnn {
 /// The mutual k-NN score, 0 to 1: the mean fraction of a frame's k nearest frames by feature
 /// (cosine) that are also among its k nearest by pose.
 ///
-/// `rows` are features (n, d), `poses` are `world_from_camera`, metres.
+/// `rows` are features (n, d), `poses` are `world_from_camera`, meters.
 ///
 /// # Errors
 /// [`Error::TooSmall`] for an option that is 0; [`Error::TooFewFrames`] when the room is too short;
@@ -95,8 +95,8 @@ pub fn mutual_knn(
     poses: &[Pose],
     options: &MutualKnn,
 ) -> Result<f64, Error> {
-    let by_feature = feature_neighbours(rows, options)?;
-    let by_pose = pose_neighbours(poses, options)?;
+    let by_feature = feature_neighbors(rows, options)?;
+    let by_pose = pose_neighbors(poses, options)?;
     let shared =
         |(a, b): (&Vec<usize>, &Vec<usize>)| a.iter().filter(|frame| b.contains(frame)).count();
     let shared: usize = by_feature.iter().zip(&by_pose).map(shared).sum();
@@ -109,7 +109,7 @@ pub fn mutual_knn(
 ///
 /// # Errors
 /// As [`mutual_knn`].
-pub fn feature_neighbours(
+pub fn feature_neighbors(
     rows: ArrayView2<'_, f32>,
     options: &MutualKnn,
 ) -> Result<Vec<Vec<usize>>, Error> {
@@ -135,15 +135,15 @@ pub fn feature_neighbours(
             .sum::<f64>()
     };
 
-    neighbours(options, distance)
+    neighbors(options, distance)
 }
 
 /// The k nearest neighbors of each sampled frame by pose, nearest first. The distance is Euclidean
-/// over (t, R[:, 0], R[:, 1]), mixing metres and unitless numbers.
+/// over (t, R[:, 0], R[:, 1]), mixing meters and unitless numbers.
 ///
 /// # Errors
 /// As [`mutual_knn`].
-pub fn pose_neighbours(poses: &[Pose], options: &MutualKnn) -> Result<Vec<Vec<usize>>, Error> {
+pub fn pose_neighbors(poses: &[Pose], options: &MutualKnn) -> Result<Vec<Vec<usize>>, Error> {
     // The first two columns of R determine the third, so nine numbers describe a pose.
     let nine = |frame: usize| -> [f64; 9] {
         let t = poses[frame].translation.vector;
@@ -165,7 +165,7 @@ pub fn pose_neighbours(poses: &[Pose], options: &MutualKnn) -> Result<Vec<Vec<us
             .sqrt()
     };
 
-    neighbours(options, distance)
+    neighbors(options, distance)
 }
 
 fn sampled(have: usize, options: &MutualKnn) -> Result<Vec<usize>, Error> {
@@ -195,7 +195,7 @@ fn sampled(have: usize, options: &MutualKnn) -> Result<Vec<usize>, Error> {
     Ok((0..frames).map(|frame| frame * stride).collect())
 }
 
-fn neighbours(
+fn neighbors(
     options: &MutualKnn,
     distance: impl Fn(usize, usize) -> f64 + Sync,
 ) -> Result<Vec<Vec<usize>>, Error> {

@@ -135,7 +135,7 @@ pub fn baselines_text(found: &MotionBaselines) -> String {
         constant_r2,
         variance_ratio,
         nearest_pose,
-        optimiser_steps,
+        optimizer_steps,
     } = found.baselines;
 
     let nearest = nearest_pose.map_or_else(String::new, |nearest| {
@@ -153,7 +153,7 @@ pub fn baselines_text(found: &MotionBaselines) -> String {
 
     format!(
         "R² of motions {:.3}; of the mean training motion {constant_r2:.3} (variance ratio of test to training \
-         motions {variance_ratio:.2}{nearest}; {optimiser_steps} optimizer steps){verdict}",
+         motions {variance_ratio:.2}{nearest}; {optimizer_steps} optimizer steps){verdict}",
         found.motion.overall
     )
 }

@@ -38,7 +38,7 @@ pub fn hit_curves(report: &Report, title: String) -> Figure {
         )
     };
     let series = report.rows.iter().map(curve).collect();
-    Figure::new(title, "ε, metres and radians mixed", "Hit@ε", series)
+    Figure::new(title, "ε, meters and radians mixed", "Hit@ε", series)
 }
 
 /// CSV with one line per navigator and the bounds of the 95 % intervals; undefined values are
@@ -84,11 +84,11 @@ pub fn evaluation_latex(report: &Report) -> String {
             } = hit;
             format!("{rate:.3} {{\\scriptsize [{low:.3}, {high:.3}]}}")
         });
-        let [metres, degrees] = medians(row);
+        let [meters, degrees] = medians(row);
 
         let cells = std::iter::once(r2.unwrap_or("--".to_owned()))
             .chain(hits)
-            .chain([format!("{metres:.3}"), format!("{degrees:.2}")]);
+            .chain([format!("{meters:.3}"), format!("{degrees:.2}")]);
         table.row(row.label(), cells);
     }
 
@@ -106,7 +106,7 @@ fn over_thresholds(report: &Report, title: fn(&f64) -> String) -> String {
     report.protocol.thresholds.iter().map(title).collect()
 }
 
-/// Median errors of the retrieved poses, metres and degrees.
+/// Median errors of the retrieved poses, meters and degrees.
 fn medians(row: &Row) -> [f64; 2] {
     let scores = &row.retrieval;
     [

@@ -29,7 +29,7 @@ pub enum Axes {
     Fitted,
     /// Both axes have one range, and the line y = x is drawn.
     Diagonal,
-    /// A metre has the same length on both axes. The legend is inside the plot.
+    /// A meter has the same length on both axes. The legend is inside the plot.
     Plan,
 }
 
@@ -89,7 +89,7 @@ impl Series {
     }
 }
 
-/// A plan view of a navigation: positions in metres and headings in radians from the x axis.
+/// A plan view of a navigation: positions in meters and headings in radians from the x axis.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PathPlot {
     /// Title above the picture.
@@ -119,7 +119,7 @@ impl From<&PathPlot> for Figure {
             }
         };
         let map = Series {
-            color: Some(MAP_COLOUR),
+            color: Some(MAP_COLOR),
             mark: Mark::Dot(2),
             ..Series::dots("frames of the map", plot.map.clone())
         };
@@ -138,13 +138,13 @@ impl From<&PathPlot> for Figure {
 
         Self {
             axes: Axes::Plan,
-            ..Self::new(&plot.title, "x, metres", "y, metres", series)
+            ..Self::new(&plot.title, "x, meters", "y, meters", series)
         }
     }
 }
 
-const MAP_COLOUR: RGBColor = RGBColor(200, 205, 212);
-const COLOURS: [RGBColor; 8] = [
+const MAP_COLOR: RGBColor = RGBColor(200, 205, 212);
+const COLORS: [RGBColor; 8] = [
     RGBColor(31, 119, 180),
     RGBColor(214, 96, 20),
     RGBColor(44, 140, 70),
@@ -232,7 +232,7 @@ impl Figure {
             ))?;
         }
 
-        for (place, (series, next)) in self.series.iter().zip(COLOURS.iter().cycle()).enumerate() {
+        for (place, (series, next)) in self.series.iter().zip(COLORS.iter().cycle()).enumerate() {
             let color = series.color.unwrap_or(*next);
             if !series.line.is_empty() {
                 let line = finite(&series.line);
@@ -274,7 +274,7 @@ impl Figure {
                 .configure_series_labels()
                 .position(SeriesLabelPosition::LowerLeft)
                 .background_style(WHITE.mix(0.85))
-                .border_style(MAP_COLOUR)
+                .border_style(MAP_COLOR)
                 .draw()?;
         }
 
@@ -313,7 +313,7 @@ impl Figure {
                 let ((x, half_x), (y, half_y)) = (span(x), span(y));
 
                 // The plot area inside the margins and labels is about 830 × 600 pixels. Widen the
-                // shorter range until a metre has the same length on both axes.
+                // shorter range until a meter has the same length on both axes.
                 let aspect = 830.0 / 600.0;
                 let half_y = half_y.max(half_x / aspect);
                 let half_x = half_y * aspect;

@@ -20,7 +20,7 @@ pub fn localization_table(found: &Localization) -> Table {
             ("ours", Some(found.ours)),
             ("nearest frame", Some(found.nearest_frame)),
             (
-                "nearest pose (by metres plus radians)",
+                "nearest pose (by meters plus radians)",
                 Some(found.nearest_pose),
             ),
             ("the adapter's full estimate", found.zero_shot),

@@ -49,7 +49,7 @@ pub use localization::{
 };
 pub use odometry::{
     OdometryJson, coverage_table, intervals_table, odometry_json, odometry_table, other_rooms_text,
-    relocalisation_text, scenarios_text,
+    relocalization_text, scenarios_text,
 };
 pub use path_errors::{
     APE_FORMULA, PathErrorsJson, RPE_FORMULA, path_errors_json, path_errors_table,

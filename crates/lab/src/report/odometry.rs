@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::table::Column::{self, Number, Text};
 use super::table::{Table, fixed};
 use crate::experiments::mapless::MaplessDrift;
-use crate::experiments::odometry::{MapPoseErrors, Relocalisation, RoomOdometry, squared_errors};
+use crate::experiments::odometry::{MapPoseErrors, Relocalization, RoomOdometry, squared_errors};
 use crate::experiments::odometry_scenarios::{DarkErrors, Scenarios};
 use crate::experiments::replay::MotionSurprise;
 use crate::experiments::tracking_intervals::TrackingIntervals;
@@ -51,7 +51,7 @@ pub fn odometry_table(rooms: &[RoomOdometry]) -> Table {
         Number("odom drift %", 1, |line| line.scores.drift.percent),
         Number("odom drift °/m", 2, |line| line.scores.drift.deg_per_m),
         Number("unknown start: LOST", 3, |line| line.unknown_start_lost),
-        Text("relocalized after", |line| line.relocalised_after.clone()),
+        Text("relocalized after", |line| line.relocalized_after.clone()),
     ];
 
     Table::of(&lines, &columns)
@@ -64,7 +64,7 @@ struct Line {
     scores: TrackingScores,
     statuses: StatusShares,
     unknown_start_lost: f64,
-    relocalised_after: String,
+    relocalized_after: String,
 }
 
 impl Line {
@@ -73,7 +73,7 @@ impl Line {
         let over = |of: fn(&RoomOdometry) -> f64| mean(&rooms.iter().map(of).collect::<Vec<_>>());
         let found: Vec<f64> = rooms
             .iter()
-            .filter_map(|room| room.unknown_start.frames_to_relocalise)
+            .filter_map(|room| room.unknown_start.frames_to_relocalize)
             .map(|frames| frames as f64)
             .collect();
 
@@ -88,7 +88,7 @@ impl Line {
                 relocalizing: over(|room| room.statuses.relocalizing),
             },
             unknown_start_lost: over(|room| room.unknown_start.lost),
-            relocalised_after: match found.len() {
+            relocalized_after: match found.len() {
                 0 => "never".to_owned(),
                 // The median covers only the rooms in which the tracker relocalized.
                 some if some < rooms.len() => {
@@ -331,7 +331,7 @@ pub fn other_rooms_text(rooms: &[RoomOdometry]) -> String {
 }
 
 /// Results of relocalizing single views, as text.
-pub fn relocalisation_text(found: &Relocalisation) -> String {
+pub fn relocalization_text(found: &Relocalization) -> String {
     let count = found.right + found.wrong + found.ambiguous;
     let share = |n: usize| n as f64 / count.max(1) as f64;
 
@@ -366,7 +366,7 @@ pub struct OdometryJson<'a> {
     /// Fractions of map poses inside the 68 % and the 95 % ellipsoid, over all rooms.
     coverage_places: MapPoseErrors,
     coverage_motions: [f64; 2],
-    relocalisation: Option<&'a Relocalisation>,
+    relocalization: Option<&'a Relocalization>,
     ape_formula: &'static str,
     rpe_formula: &'static str,
     alignment: &'static str,
@@ -376,7 +376,7 @@ pub struct OdometryJson<'a> {
 /// and the formulas.
 pub fn odometry_json<'a>(
     rooms: &'a [RoomOdometry],
-    relocalisation: Option<&'a Relocalisation>,
+    relocalization: Option<&'a Relocalization>,
 ) -> OdometryJson<'a> {
     OdometryJson {
         rooms,
@@ -386,7 +386,7 @@ pub fn odometry_json<'a>(
         scenarios: scenarios(rooms),
         coverage_places: map_poses(rooms),
         coverage_motions: json::covered(&squared_errors(&motions(rooms))),
-        relocalisation,
+        relocalization,
         ape_formula: super::APE_FORMULA,
         rpe_formula: super::RPE_FORMULA,
         alignment: "none",

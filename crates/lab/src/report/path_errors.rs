@@ -10,7 +10,7 @@ use crate::experiments::path_comparison::PathComparison;
 use seese3_core::trajectory::{Error, Relation, RpePairs, Statistics};
 
 /// Definition of the absolute pose error, printed with the results.
-pub const APE_FORMULA: &str = "APE: E_i = est_i⁻¹ ref_i after alignment; translation ‖t(E)‖ in metres, rotation ∠E in \
+pub const APE_FORMULA: &str = "APE: E_i = est_i⁻¹ ref_i after alignment; translation ‖t(E)‖ in meters, rotation ∠E in \
                                radians, full ‖E − I‖_F; poses world_from_camera";
 /// Definition of the relative pose error, printed with the results.
 pub const RPE_FORMULA: &str =

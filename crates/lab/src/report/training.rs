@@ -181,7 +181,7 @@ impl Serialize for ProtocolJson<'_> {
         record.serialize_field("training_pairs", &training.pair_count)?;
         record.serialize_field("drawn_from_strides", &drawn_from_strides)?;
         record.serialize_field("epochs", &config.epochs)?;
-        record.serialize_field("optimiser_steps", &training.optimiser_steps())?;
+        record.serialize_field("optimizer_steps", &training.optimizer_steps())?;
         record.serialize_field("batch", &config.batch)?;
         record.serialize_field("learning_rate", &config.learning_rate)?;
         record.serialize_field("weight_decay", &config.weight_decay)?;
@@ -191,12 +191,12 @@ impl Serialize for ProtocolJson<'_> {
         record.serialize_field("charts", &config.charts)?;
         record.serialize_field("mixing", config.mixing.name())?;
         record.serialize_field("loss", config.loss.name())?;
-        record.serialize_field("standardised_features", &config.standardise)?;
+        record.serialize_field("standardized_features", &config.standardize)?;
         record.serialize_field("noise", &config.noise)?;
         record.serialize_field("weight_average", &config.average)?;
         record.serialize_field("through_zero", &config.through_zero)?;
         record.serialize_field("calibrated_on", &calibrated_on.collect::<Vec<_>>())?;
-        record.serialize_field("twist", "body frame, (v, omega), metres and radians")?;
+        record.serialize_field("twist", "body frame, (v, omega), meters and radians")?;
         // Degrees of freedom of the σ that standardizes the training twists: 0, the population
         // deviation. Deviations over seeds, elsewhere in these files, are sample deviations.
         record.serialize_field("deviation_ddof", &0)?;

@@ -16,7 +16,7 @@ use crate::report::{
 
 /// The paper's navigator.
 pub const AFFINE: &str = "inverse-poincare-affine";
-/// The refit on z-scored motions. The ridge's α would over-shrink raw metres and radians.
+/// The refit on z-scored motions. The ridge's α would over-shrink raw meters and radians.
 const REFIT: &str = "ridge-refit-z-scored-in-sample";
 /// The service's navigator.
 pub const HOMOGENEOUS: &str = "inverse-poincare-homogeneous";

@@ -356,7 +356,7 @@ impl Reproduction<'_> {
     fn training_words(&self) -> String {
         match self.options.epochs {
             Some(epochs) => format!("Preset base, cut to {epochs} epochs."),
-            None => "Preset base: at least 400 optimiser steps.".to_owned(),
+            None => "Preset base: at least 400 optimizer steps.".to_owned(),
         }
     }
 }

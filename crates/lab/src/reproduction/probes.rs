@@ -155,7 +155,7 @@ fn claim(given: &Reproduction<'_>, by_set: &[Vec<ProbeRecord>]) -> Result<Claim,
     };
 
     Ok(Claim {
-        claim: "topology: a trained encoder's neighbours at a long stride are neighbours by pose, more than raw pixels' (M1)".to_owned(),
+        claim: "topology: a trained encoder's neighbors at a long stride are neighbors by pose, more than raw pixels' (M1)".to_owned(),
         verdict: Verdict::of_intervals(&above),
         found: format!(
             "M1 at the long stride over that of {}, room by room: {differences}",

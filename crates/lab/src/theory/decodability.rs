@@ -12,7 +12,7 @@ use seese3_core::statistics::median;
 
 /// Width of the constructed features.
 const DIM: usize = 48;
-/// Radius of the region, metres and radians.
+/// Radius of the region, meters and radians.
 const RADIUS: f64 = 0.3;
 /// Number of poses sampled along a geodesic, including both ends.
 const STATIONS: usize = 33;
@@ -22,7 +22,7 @@ const SLACK: f64 = 1e-6;
 pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Vec<Check> {
     let map = ConstructedMap::new(DIM, 12, random);
 
-    let centre = exp(&Twist {
+    let center = exp(&Twist {
         linear: [0.3, -0.2, 0.5].into(),
         angular: [0.4, 0.1, -0.3].into(),
     });
@@ -38,9 +38,9 @@ pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Vec<Check> {
 
     // Theorem 3: the local readout's error is quadratic in the motion (order 2): halving the motion
     // divides the error by four. Drawn maps are not smooth enough for the full order.
-    let order = order(&map, &centre, 1e-2, effort.samples, random);
+    let order = order(&map, &center, 1e-2, effort.samples, random);
     let drawn = order_of_drawn(&room, &pose, effort.samples / 4, random);
-    let global = global(&map, &centre, effort.samples, random);
+    let global = global(&map, &center, effort.samples, random);
 
     vec![
         check(
@@ -124,11 +124,11 @@ struct Global {
 }
 
 /// The largest ratios over pairs of poses in the region. Suprema are taken along geodesics.
-fn global(map: &ConstructedMap, centre: &Pose, samples: usize, random: &mut ChaCha8Rng) -> Global {
+fn global(map: &ConstructedMap, center: &Pose, samples: usize, random: &mut ChaCha8Rng) -> Global {
     // W is the readout at the center, where WJ = I; the theorems bound its error elsewhere.
-    let w = readout(map, centre);
+    let w = readout(map, center);
     let pairs: Vec<[Pose; 2]> = (0..samples)
-        .map(|_| [0, 1].map(|_| pose_near(centre, RADIUS, random)))
+        .map(|_| [0, 1].map(|_| pose_near(center, RADIUS, random)))
         .collect();
 
     let off = |pose: &Pose| spectral(&(&w * map.jacobian(pose) - DMatrix::identity(6, 6)));
@@ -143,9 +143,9 @@ fn global(map: &ConstructedMap, centre: &Pose, samples: usize, random: &mut ChaC
                 .fold(0.0, f64::max);
 
             // 5b: ‖WJ(g) − I‖ ≤ distance · sup ‖W∇J‖, the supremum along the geodesic from the
-            // centre to g.
-            let away = body_twist(centre, from);
-            let steepest = stations(centre, away)
+            // center to g.
+            let away = body_twist(center, from);
+            let steepest = stations(center, away)
                 .map(|pose| slope(map, &w, &pose, away))
                 .fold(0.0, f64::max);
 

@@ -13,7 +13,7 @@ use seese3_core::geometry::{Pose, Twist, exp};
 
 /// Width of the constructed features.
 const DIM: usize = 48;
-/// Radius of the region of poses, metres and radians.
+/// Radius of the region of poses, meters and radians.
 const RADIUS: f64 = 0.6;
 /// Radius of the region of poses for drawn maps.
 const DRAWN_RADIUS: f64 = 0.15;
@@ -48,9 +48,9 @@ pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Result<Vec<Chec
     let path = dimension(&embedding, &line)?;
 
     // A rendered image need not be an embedding of the pose, so it has only an upper bound.
-    let (room, centre) = DrawnMap::new(effort.seed, 0);
+    let (room, center) = DrawnMap::new(effort.seed, 0);
     let seen: Vec<Pose> = (0..effort.poses / 2)
-        .map(|_| pose_near(&centre, DRAWN_RADIUS, random))
+        .map(|_| pose_near(&center, DRAWN_RADIUS, random))
         .collect();
     let drawn = dimension(&room, &seen)?;
 
@@ -80,12 +80,12 @@ pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Result<Vec<Chec
             Bound::Between(0.8, 1.2),
         ),
         check(
-            "TwoNN of a drawn room's patch colours",
+            "TwoNN of a drawn room's patch colors",
             drawn.two_nn.linear,
             Bound::AtMost(6.0 + TOLERANCE),
         ),
         check(
-            "MLE of a drawn room's patch colours",
+            "MLE of a drawn room's patch colors",
             drawn.mle_biased.harmonic,
             Bound::AtMost(6.0 + TOLERANCE),
         ),

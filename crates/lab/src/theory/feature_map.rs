@@ -7,9 +7,9 @@ use rand_chacha::ChaCha8Rng;
 use seese3_core::geometry::{Pose, Twist, exp};
 use seese3_studio::{Camera, Scene, SuiteRoom, render};
 
-/// Step of the central differences for constructed maps, metres and radians.
+/// Step of the central differences for constructed maps, meters and radians.
 const STEP: f64 = 1e-4;
-/// Step of the central differences for drawn maps, metres and radians: large compared with the
+/// Step of the central differences for drawn maps, meters and radians: large compared with the
 /// effect of pixel rounding.
 const DRAWN_STEP: f64 = 0.02;
 
@@ -18,7 +18,7 @@ pub trait FeatureMap: Sync {
     /// f(g).
     fn feature(&self, pose: &Pose) -> DVector<f64>;
 
-    /// The difference step of [`FeatureMap::jacobian`], metres and radians.
+    /// The difference step of [`FeatureMap::jacobian`], meters and radians.
     fn step(&self) -> f64;
 
     /// J(g), shape (d, 6): the derivative of f(g exp(ξ)) with respect to ξ = (v, ω) at 0, by
@@ -145,9 +145,9 @@ pub(super) fn twist_of_length(length: f64, random: &mut ChaCha8Rng) -> Twist {
     }
 }
 
-/// A random pose at most `radius` from `centre`, by the length of the twist between them.
-pub(super) fn pose_near(centre: &Pose, radius: f64, random: &mut ChaCha8Rng) -> Pose {
+/// A random pose at most `radius` from `center`, by the length of the twist between them.
+pub(super) fn pose_near(center: &Pose, radius: f64, random: &mut ChaCha8Rng) -> Pose {
     // In six dimensions, the sixth root makes points uniform in the ball.
     let length = radius * random.random_range(0.0f64..1.0).powf(1.0 / 6.0);
-    centre * exp(&twist_of_length(length, random))
+    center * exp(&twist_of_length(length, random))
 }

@@ -28,7 +28,7 @@ impl Pinhole {
     }
 }
 
-/// The Jacobian of the image flow as printed in the paper, with respect to (v, ω): pixels per metre
+/// The Jacobian of the image flow as printed in the paper, with respect to (v, ω): pixels per meter
 /// and pixels per radian.
 ///
 /// It is the negative of the image flow of a camera that moves by the body twist.

@@ -3,7 +3,7 @@
 //! - *Constructed* feature maps are exactly known smooth functions of the pose. *Drawn* maps are
 //!   colors of a rendered studio image, averaged over patches. Drawn maps are only nearly smooth:
 //!   pixels have 8 bits and edges alias.
-//! - Lengths of twists add metres and radians one to one (A-34: length scale 1 m/rad).
+//! - Lengths of twists add meters and radians one to one (A-34: length scale 1 m/rad).
 //! - A check only measures; nothing is fitted to the bound.
 
 mod bracket;

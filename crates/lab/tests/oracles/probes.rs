@@ -6,8 +6,8 @@ use ndarray::Array2;
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_core::splits::Split;
 use seese3_lab::probes::{
-    Duplicates, Error, IntrinsicDimension, MutualKnn, feature_neighbours, intrinsic_dimension,
-    mutual_knn, pose_neighbours, ridge_probe,
+    Duplicates, Error, IntrinsicDimension, MutualKnn, feature_neighbors, intrinsic_dimension,
+    mutual_knn, pose_neighbors, ridge_probe,
 };
 use serde_json::Value;
 
@@ -25,7 +25,7 @@ fn options(row: &Value) -> MutualKnn {
 }
 
 /// Oracle: brute force in NumPy, the same as scikit-learn's in all settings.
-fn mutual_neighbours_match_brute_force(room: &str, folder: PathBuf) {
+fn mutual_neighbors_match_brute_force(room: &str, folder: PathBuf) {
     let expected = json(&folder.join("m1_mutual_knn/expected.json"));
     let lists = Tensors::open(&folder.join("m1_mutual_knn/neighbours.safetensors"));
     let z = features(&folder, room);
@@ -54,19 +54,19 @@ fn mutual_neighbours_match_brute_force(room: &str, folder: PathBuf) {
             };
 
             assert_eq!(
-                flat(feature_neighbours(z.view(), &options).unwrap()),
+                flat(feature_neighbors(z.view(), &options).unwrap()),
                 stored("feature")
             );
 
             assert_eq!(
-                flat(pose_neighbours(&poses, &options).unwrap()),
+                flat(pose_neighbors(&poses, &options).unwrap()),
                 stored("pose")
             );
         }
     }
 }
 
-seese3_testing::on_oracle_rooms!(mutual_neighbours_match_brute_force);
+seese3_testing::on_oracle_rooms!(mutual_neighbors_match_brute_force);
 
 /// Oracle: six frames by hand (the oracle's README), with ties, and an exclusion that leaves too
 /// few.
@@ -93,9 +93,9 @@ fn six_frames_by_hand() {
 
         let found = mutual_knn(z.view(), &poses, &options).unwrap();
         near(&format!("{options:?}"), found, number(&row["score"]), 1e-12);
-        let neighbours = feature_neighbours(z.view(), &options).unwrap();
+        let neighbors = feature_neighbors(z.view(), &options).unwrap();
 
-        assert_eq!(serde_json::json!(neighbours), row["feature_neighbours"]);
+        assert_eq!(serde_json::json!(neighbors), row["feature_neighbours"]);
     }
 
     let too_few = MutualKnn {

@@ -3,7 +3,7 @@
 use ndarray::{Array2, ArrayView1};
 
 use super::Error;
-use seese3_core::adapter::{self, TEMPORAL_NEIGHBOURS};
+use seese3_core::adapter::{self, TEMPORAL_NEIGHBORS};
 use seese3_core::index::{ExactIndex, Exclusion, Index};
 use seese3_core::room::FrameId;
 use seese3_core::splits::is_in_left_out_block;
@@ -65,16 +65,16 @@ pub fn match_limits(rooms: &[Array2<f64>]) -> Result<MatchLimits, Error> {
 }
 
 /// Median distance from a mapped frame to its nearest mapped frame more than
-/// [`TEMPORAL_NEIGHBOURS`] rows away.
+/// [`TEMPORAL_NEIGHBORS`] rows away.
 fn typical_distance(index: &ExactIndex, room: &Array2<f64>, mapped: &[FrameId]) -> f64 {
     let distances: Vec<f64> = mapped
         .iter()
-        .filter_map(|&centre| {
+        .filter_map(|&center| {
             let exclusion = Exclusion {
-                centre,
-                radius: TEMPORAL_NEIGHBOURS,
+                center,
+                radius: TEMPORAL_NEIGHBORS,
             };
-            let query = room.row(centre.row()).to_vec();
+            let query = room.row(center.row()).to_vec();
             Some(index.nearest(&query, 1, Some(exclusion)).first()?.distance)
         })
         .collect();

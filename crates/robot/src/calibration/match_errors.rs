@@ -64,10 +64,10 @@ fn add_matches(room: &EmbeddedRoom<'_>, whitened: &Array2<f64>, matches: &mut Ve
     let index = ExactIndex::new(whitened.view(), &frames);
 
     for radius in LEFT_OUT_RADII {
-        for &centre in &frames {
-            let row = centre.row();
+        for &center in &frames {
+            let row = center.row();
             let query = whitened.row(row).to_vec();
-            let nearest = index.nearest(&query, 1, Some(Exclusion { centre, radius }));
+            let nearest = index.nearest(&query, 1, Some(Exclusion { center, radius }));
             let Some(best) = nearest.first() else {
                 continue;
             };

@@ -127,7 +127,7 @@ fn config(seed: u64) -> TrainConfig {
         epochs: EPOCHS,
         learning_rate: 3e-3,
         hidden: 128,
-        standardise: true,
+        standardize: true,
         noise: 0.5,
         average: 0.99,
         through_zero: true,

@@ -1,7 +1,7 @@
 //! Estimates of the motion between a view and its most similar mapped frames.
 
 use seese3_core::geometry::Twist;
-use seese3_core::index::Neighbour;
+use seese3_core::index::Neighbor;
 use strum::{Display, VariantArray};
 
 /// Source of the relative pose between a view and its most similar mapped frame.
@@ -37,7 +37,7 @@ impl PartRule {
 #[derive(Debug, Clone, PartialEq)]
 pub struct MotionHypotheses {
     /// Most similar mapped frame.
-    pub nearest: Neighbour,
+    pub nearest: Neighbor,
     /// Distance of that frame, in standard deviations of a feature column.
     pub distance: f64,
     /// Motion from that frame to the view, estimated by the adapter of other rooms.

@@ -10,7 +10,7 @@ use super::{Error, check_mapped};
 use crate::tracking::PoseWithCovariance;
 use seese3_core::adapter::{self, Adapter, column_scale};
 use seese3_core::geometry::{Pose, Twist, body_twist, exp};
-use seese3_core::index::{ExactIndex, Index, Neighbour};
+use seese3_core::index::{ExactIndex, Index, Neighbor};
 use seese3_core::room::FrameId;
 use seese3_core::statistics::median;
 use seese3_core::training::RoomData;
@@ -18,7 +18,7 @@ use seese3_core::training::RoomData;
 /// Localizes views relative to their most similar mapped frame.
 pub struct Localizer {
     poses: Vec<Pose>,
-    standardisation: Standardisation,
+    standardization: Standardization,
     index: ExactIndex,
     zero_shot: Option<Embedded>,
     fitted: Option<Embedded>,
@@ -31,7 +31,7 @@ const WITNESSES: usize = 4;
 #[derive(Debug, Clone, PartialEq)]
 pub struct LocatedView {
     /// Most similar mapped frame; its distance is in standard deviations of a feature column.
-    pub nearest: Neighbour,
+    pub nearest: Neighbor,
     /// `world_from_camera`, with the covariance of its error in its body frame.
     pub pose: PoseWithCovariance,
     /// Estimator of the translation from that frame.
@@ -41,13 +41,13 @@ pub struct LocatedView {
 }
 
 /// Z-scoring of features, so that distances are comparable between rooms.
-struct Standardisation {
+struct Standardization {
     mean: Array1<f64>,
     /// Standard deviation of each column times √d: a distance is a root mean square over columns.
     scale: Array1<f64>,
 }
 
-impl Standardisation {
+impl Standardization {
     fn of(rows: ArrayView2<'_, f64>) -> Self {
         let (mean, deviation) = column_scale(rows);
         let scale = deviation * (rows.ncols() as f64).sqrt();
@@ -105,8 +105,8 @@ impl Localizer {
         check_mapped(data.room, mapped, 1)?;
         let rows = data.features.rows().mapv(f64::from);
         let known: Vec<usize> = mapped.iter().map(|frame| frame.row()).collect();
-        let standardisation = Standardisation::of(rows.select(ndarray::Axis(0), &known).view());
-        let standardised = standardisation.rows(rows.view());
+        let standardization = Standardization::of(rows.select(ndarray::Axis(0), &known).view());
+        let standardized = standardization.rows(rows.view());
 
         let embedded = |adapter: Option<Arc<Adapter>>| {
             adapter
@@ -116,8 +116,8 @@ impl Localizer {
 
         Ok(Self {
             poses: data.room.poses().to_vec(),
-            index: ExactIndex::new(standardised.view(), mapped),
-            standardisation,
+            index: ExactIndex::new(standardized.view(), mapped),
+            standardization,
             zero_shot: embedded(zero_shot)?,
             fitted: embedded(fitted)?,
         })
@@ -137,7 +137,7 @@ impl Localizer {
     /// # Errors
     /// [`Error::Adapter`] if the feature has the wrong width or a value is not finite.
     pub fn read(&self, feature: &[f32]) -> Result<MotionHypotheses, Error> {
-        let expected = self.standardisation.mean.len();
+        let expected = self.standardization.mean.len();
         if feature.len() != expected {
             let actual = feature.len();
             return Err(adapter::Error::FeatureDim { expected, actual }.into());
@@ -152,7 +152,7 @@ impl Localizer {
         }
 
         let row = Array2::from_shape_fn((1, expected), |(_, column)| f64::from(feature[column]));
-        let query = self.standardisation.rows(row.view()).row(0).to_vec();
+        let query = self.standardization.rows(row.view()).row(0).to_vec();
         let witnesses = self.index.nearest(&query, WITNESSES, None);
         let nearest = witnesses[0];
 
@@ -182,7 +182,7 @@ impl Localizer {
 
     /// Median distance from the pose estimated relative to the first witness to the poses estimated
     /// relative to the others; see [`MotionHypotheses::disagreement`].
-    fn disagreement(&self, witnesses: &[Neighbour], feature: &[f32]) -> Result<f64, Error> {
+    fn disagreement(&self, witnesses: &[Neighbor], feature: &[f32]) -> Result<f64, Error> {
         let best_informed = if self.fitted.is_some() {
             &self.fitted
         } else {

@@ -93,8 +93,8 @@ fn near(poses: &[Pose], mapped: &[FrameId], count: usize) -> Vec<[usize; 2]> {
 
 /// Distance between two poses: meters plus radians.
 fn apart(a: &Pose, b: &Pose) -> f64 {
-    let metres = (a.translation.vector - b.translation.vector).norm();
-    metres + a.rotation.angle_to(&b.rotation)
+    let meters = (a.translation.vector - b.translation.vector).norm();
+    meters + a.rotation.angle_to(&b.rotation)
 }
 
 #[cfg(test)]
@@ -117,7 +117,7 @@ mod tests {
     /// Oracle: by hand. Every tenth frame is mapped, so temporal pairs span up to five mapped
     /// frames. The frame at the same place on the way back is among the nearest.
     #[test]
-    fn pairs_join_neighbours_in_time_and_in_place() {
+    fn pairs_join_neighbors_in_time_and_in_place() {
         let room = there_and_back(200);
         let mapped: Vec<FrameId> = (0..200).step_by(10).map(FrameId).collect();
 

@@ -266,7 +266,7 @@ fn residual(trial: &HeldOutView, translation: PartRule, rotation: PartRule) -> V
 #[cfg(test)]
 mod tests {
     use super::*;
-    use seese3_core::index::Neighbour;
+    use seese3_core::index::Neighbor;
     use seese3_core::room::FrameId;
 
     /// Trials in which the fitted adapter is accurate near the map and wrong far from it.
@@ -289,7 +289,7 @@ mod tests {
 
                 HeldOutView {
                     readings: MotionHypotheses {
-                        nearest: Neighbour {
+                        nearest: Neighbor {
                             frame: FrameId(0),
                             distance,
                         },

@@ -23,7 +23,7 @@ use crate::visual_odometry::{
 };
 use camera::CameraVotes;
 use seese3_core::geometry::{CameraIntrinsics, Pose};
-use seese3_core::index::Neighbour;
+use seese3_core::index::Neighbor;
 use seese3_core::keypoints::Keypoints;
 use seese3_core::room::FrameId;
 
@@ -90,7 +90,7 @@ impl MatchedPose {
     pub fn best_match(&self) -> BestMatch {
         BestMatch {
             room: self.room,
-            frame: Neighbour {
+            frame: Neighbor {
                 frame: self.best_frame,
                 distance: self.novelty,
             },

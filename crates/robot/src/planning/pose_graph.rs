@@ -7,7 +7,7 @@ use ndarray::{ArrayView1, s};
 
 use seese3_core::cancel::{Cancellation, Cancelled};
 use seese3_core::geometry::{Pose, PoseError, Twist, body_twist};
-use seese3_core::index::Neighbour;
+use seese3_core::index::Neighbor;
 use seese3_core::navigation::{Feedback, Navigator, RetrievedFrame};
 use seese3_core::room::FrameId;
 
@@ -178,12 +178,7 @@ impl<'a> PoseGraph<'a> {
 
     /// Neighbors of a frame within `longest_hop`, with the motions to them; at most `most`, nearest
     /// first. The length is ‖(v, ω)‖, meters and radians mixed.
-    pub fn neighbours(
-        &self,
-        from: FrameId,
-        longest_hop: f64,
-        most: usize,
-    ) -> Vec<(FrameId, Twist)> {
+    pub fn neighbors(&self, from: FrameId, longest_hop: f64, most: usize) -> Vec<(FrameId, Twist)> {
         let pose = &self.poses[from.row()];
         let position = pose.translation.vector;
         let near = |to: &&FrameId| {
@@ -336,14 +331,14 @@ impl Route {
             let pose = navigator.room().poses()[frame.row()];
             let latent = navigator.latents().row(frame.row()).to_owned();
             let apart = &latent.slice(coordinates) - &at.1.slice(coordinates);
-            let neighbour = Neighbour {
+            let neighbor = Neighbor {
                 frame,
                 distance: apart.dot(&apart).sqrt(),
             };
 
             reported.push(Feedback {
                 step,
-                frame: Some(RetrievedFrame { neighbour, pose }),
+                frame: Some(RetrievedFrame { neighbor, pose }),
                 motion: body_twist(&at.0, &pose),
                 remaining: PoseError::between(&pose, goal),
                 recoveries: 0,

@@ -124,14 +124,14 @@ impl Appearance {
             return None;
         }
 
-        let mut centred = features.rows.select(Axis(0), &sampled);
-        let mean = centred.mean_axis(Axis(0))?;
-        centred -= &mean;
+        let mut centered = features.rows.select(Axis(0), &sampled);
+        let mean = centered.mean_axis(Axis(0))?;
+        centered -= &mean;
 
         // The Gram matrix of the frames has the same nonzero eigenvalues as the larger covariance
         // of the columns.
         let count = sampled.len() as f64;
-        let products = centred.dot(&centred.t()) / count;
+        let products = centered.dot(&centered.t()) / count;
         let eigen = SymmetricEigen::new(to_nalgebra(products.view()));
         let mut order: Vec<usize> = (0..sampled.len()).collect();
         order.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
@@ -161,7 +161,7 @@ impl Appearance {
                     .collect::<Array1<f64>>(),
             );
         }
-        let mut components = weights.t().dot(&centred);
+        let mut components = weights.t().dot(&centered);
         components *= SPREAD / mean_square.sqrt();
 
         Some(Self { mean, components })

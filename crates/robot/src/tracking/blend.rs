@@ -12,7 +12,7 @@ use super::PoseWithCovariance;
 use super::appearance::part_of;
 use seese3_core::adapter::ErrorModel;
 use seese3_core::geometry::{Pose, Twist, body_twist, exp};
-use seese3_core::index::{Nearest, Neighbour, distance};
+use seese3_core::index::{Nearest, Neighbor, distance};
 use seese3_core::navigation::Navigator;
 use seese3_core::room::FrameId;
 use seese3_core::statistics::robust_covariance;
@@ -85,7 +85,7 @@ struct LeftOut {
 impl Blend {
     /// Blends the frames nearest to a view; `nearest` is in order of distance and not empty.
     /// `second_opinion` is the view's pose by another similarity measure, if there is one.
-    pub fn of(navigator: &Navigator, nearest: &[Neighbour], second_opinion: Option<&Pose>) -> Self {
+    pub fn of(navigator: &Navigator, nearest: &[Neighbor], second_opinion: Option<&Pose>) -> Self {
         let poses = navigator.room().poses();
         let first = poses[nearest[0].frame.row()];
 
@@ -257,12 +257,12 @@ pub struct Likeness<'a> {
 }
 
 /// Distances of all mapped frames from one of them.
-fn distances_from(coordinates: &Array2<f64>, mapped: &[FrameId], frame: FrameId) -> Vec<Neighbour> {
+fn distances_from(coordinates: &Array2<f64>, mapped: &[FrameId], frame: FrameId) -> Vec<Neighbor> {
     // Rows of an array in standard layout are slices.
     let coordinates = coordinates.as_standard_layout();
     let row = |frame: FrameId| coordinates.row(frame.row()).to_slice().unwrap_or_default();
 
-    let of = |&other: &FrameId| Neighbour {
+    let of = |&other: &FrameId| Neighbor {
         frame: other,
         distance: distance(row(other), row(frame)),
     };
@@ -288,11 +288,11 @@ fn blends_without(
     let timeline = navigator.room().timeline();
     let rounds = LEFT_OUT_ROWS.map(Some).into_iter().chain([None]);
     let found = |rows: Option<u32>| {
-        let is_left = |other: &&Neighbour| match rows {
+        let is_left = |other: &&Neighbor| match rows {
             Some(rows) => other.frame.0.abs_diff(frame.0) > rows,
             None => !timeline.joins(other.frame, frame),
         };
-        let left = |distances: &[Neighbour]| -> Option<Vec<Neighbour>> {
+        let left = |distances: &[Neighbor]| -> Option<Vec<Neighbor>> {
             let mut nearest = Nearest::new(LOOKED_AT);
             for other in distances.iter().filter(is_left) {
                 nearest.offer(*other);

@@ -8,8 +8,8 @@ use super::appearance::{Appearance, RoomAppearance};
 use super::blend::{Blend, BlendErrors, LOOKED_AT, Likeness, ViewErrors};
 use super::clock::frame_period_s;
 use super::{Error, PoseWithCovariance};
-use seese3_core::adapter::{ErrorModel, TEMPORAL_NEIGHBOURS};
-use seese3_core::index::{ExactIndex, Exclusion, Index, Neighbour};
+use seese3_core::adapter::{ErrorModel, TEMPORAL_NEIGHBORS};
+use seese3_core::index::{ExactIndex, Exclusion, Index, Neighbor};
 use seese3_core::navigation::Navigator;
 use seese3_core::room::{FrameId, Room};
 use seese3_core::statistics::median;
@@ -59,7 +59,7 @@ struct AppearanceMap {
 
 impl AppearanceMap {
     /// The mapped frames most similar to a feature of shape (d,).
-    fn nearest(&self, feature: &[f32], count: usize) -> Vec<Neighbour> {
+    fn nearest(&self, feature: &[f32], count: usize) -> Vec<Neighbor> {
         let coordinates = self.appearance.coordinates(feature).to_vec();
         self.index.nearest(&coordinates, count, None)
     }
@@ -82,7 +82,7 @@ pub struct Map {
 pub struct MapMatch {
     /// Most similar mapped frames, best first; at least one. The distances are those of latents, in
     /// standard deviations of frame noise.
-    pub nearest: Vec<Neighbour>,
+    pub nearest: Vec<Neighbor>,
     /// Distance of the nearest latent, in standard deviations of frame noise, comparable between
     /// rooms.
     pub distance: f64,
@@ -121,10 +121,10 @@ impl Map {
         // The temporal neighborhood covers the same time as in the calibration rooms.
         let rows_per_frame =
             error_model.statistics().frame_period_s / frame_period_s(navigator.room());
-        let neighbours = (f64::from(TEMPORAL_NEIGHBOURS) * rows_per_frame)
+        let neighbors = (f64::from(TEMPORAL_NEIGHBORS) * rows_per_frame)
             .round()
             .max(1.0);
-        let typical_distance = typical_distance(&index, &whitened, mapped, neighbours as u32);
+        let typical_distance = typical_distance(&index, &whitened, mapped, neighbors as u32);
         if !(typical_distance.is_finite() && typical_distance > 0.0) {
             return Err(Error::SmallMap {
                 room: navigator.room().id().clone(),
@@ -220,7 +220,7 @@ impl Map {
         let mut by_latent = self.index.nearest(&whitened, count.max(LOOKED_AT), None);
         // Not reachable: a map without frames has no typical distance and is rejected.
         if by_latent.is_empty() {
-            by_latent.push(Neighbour {
+            by_latent.push(Neighbor {
                 frame: FrameId(0),
                 distance: f64::INFINITY,
             });
@@ -270,12 +270,12 @@ impl Map {
     }
 
     /// The same frames with the distances of their latents from a whitened latent.
-    fn with_latent_distances(&self, frames: &[Neighbour], whitened: &[f64]) -> Vec<Neighbour> {
+    fn with_latent_distances(&self, frames: &[Neighbor], whitened: &[f64]) -> Vec<Neighbor> {
         let latents = self.navigator.latents();
-        let of_latent = |found: &Neighbour| {
+        let of_latent = |found: &Neighbor| {
             let other = self.whitened(latents.row(found.frame.row()));
             let squares = whitened.iter().zip(other).map(|(a, b)| (a - b).powi(2));
-            Neighbour {
+            Neighbor {
                 frame: found.frame,
                 distance: squares.sum::<f64>().sqrt(),
             }
@@ -294,24 +294,24 @@ impl Map {
     }
 }
 
-/// Median distance from a mapped frame to its nearest mapped frame more than `neighbours` rows
+/// Median distance from a mapped frame to its nearest mapped frame more than `neighbors` rows
 /// away: the typical distance between views when a camera returns to a place.
 fn typical_distance(
     index: &ExactIndex,
     whitened: &Array2<f64>,
     mapped: &[FrameId],
-    neighbours: u32,
+    neighbors: u32,
 ) -> f64 {
     let every = mapped.len().div_ceil(SAMPLED_FRAMES).max(1);
     let distances: Vec<f64> = mapped
         .iter()
         .step_by(every)
-        .filter_map(|&centre| {
+        .filter_map(|&center| {
             let exclusion = Exclusion {
-                centre,
-                radius: neighbours,
+                center,
+                radius: neighbors,
             };
-            let row = whitened.row(centre.row()).to_vec();
+            let row = whitened.row(center.row()).to_vec();
             Some(index.nearest(&row, 1, Some(exclusion)).first()?.distance)
         })
         .collect();

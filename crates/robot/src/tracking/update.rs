@@ -4,7 +4,7 @@ use nalgebra::Matrix6;
 
 use super::PoseWithCovariance;
 use seese3_core::geometry::Twist;
-use seese3_core::index::Neighbour;
+use seese3_core::index::Neighbor;
 
 /// Localization status of a stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -40,7 +40,7 @@ pub struct BestMatch {
     /// The room, an index of the stream's rooms.
     pub room: usize,
     /// The mapped frame, with its distance.
-    pub frame: Neighbour,
+    pub frame: Neighbor,
     /// The other camera of the view; `None` for the stream's own camera.
     pub camera: Option<u32>,
 }

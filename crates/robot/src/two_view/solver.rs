@@ -61,7 +61,7 @@ mod spread {
     pub const SCALE: f64 = 0.31;
     /// Standard deviation of each translation component: fraction of the length, and meters.
     pub const SHARE: f64 = 0.10;
-    pub const METRES: f64 = 0.006;
+    pub const METERS: f64 = 0.006;
     /// Standard deviation of each rotation component: fraction of the angle, and radians.
     pub const TURN_SHARE: f64 = 0.06;
     pub const RADIANS: f64 = 0.004;
@@ -346,10 +346,10 @@ impl<'a> Found<'a> {
     /// The motion after shrinkage of the translation, and the covariance of ξ in
     /// true = motion · exp(ξ), ordered (v, ω). `None` if the matches are degenerate.
     pub fn shrunk_with_covariance(&self) -> Option<(Pose, Matrix6<f64>)> {
-        let (share, metres) = SHRINKAGE;
+        let (share, meters) = SHRINKAGE;
         let (information, ..) = self.normal_equations();
         let shift = self.rotation.inverse() * self.translation;
-        let towards_none = 1.0 / (share.powi(2) * shift.norm_squared() + metres.powi(2));
+        let towards_none = 1.0 / (share.powi(2) * shift.norm_squared() + meters.powi(2));
 
         let mut posterior = information / DEPENDENCE;
         let mut pull = Vector6::zeros();
@@ -365,7 +365,7 @@ impl<'a> Found<'a> {
 
         let turned =
             spread::RADIANS.powi(2) + (spread::TURN_SHARE * drawn.rotation.angle()).powi(2);
-        let even = spread::SHARE.powi(2) * shift.norm_squared() + spread::METRES.powi(2);
+        let even = spread::SHARE.powi(2) * shift.norm_squared() + spread::METERS.powi(2);
         let mut spread = covariance * spread::MATCHES;
         let along = shift * shift.transpose() * spread::SCALE.powi(2);
         for row in 0..3 {

@@ -1,4 +1,4 @@
-//! An adapter fitted to one room: better than its neighbours' poses near the map, and harmless far
+//! An adapter fitted to one room: better than its neighbors' poses near the map, and harmless far
 //! from it.
 
 use std::sync::Arc;

@@ -110,7 +110,7 @@ fn known(pose: Pose, deviation: f64) -> Option<PoseWithCovariance> {
     Some(PoseWithCovariance::known(pose, deviation, deviation))
 }
 
-/// Oracle: the true poses. A part of the map was recorded two metres off: what its frames say is
+/// Oracle: the true poses. A part of the map was recorded two meters off: what its frames say is
 /// not believed while the camera passes them, and the pose stays where it is.
 #[test]
 fn a_wrong_match_cannot_pull_the_pose() {
@@ -147,7 +147,7 @@ fn a_wrong_match_cannot_pull_the_pose() {
 /// same large number look like no place of the room, and tell no motion wrongly. A camera that is
 /// known to be in the room is corrected by its features all the same, and is not TRACKING.
 #[test]
-fn a_known_camera_with_spoilt_latents_is_corrected_by_its_features() {
+fn a_known_camera_with_spoiled_latents_is_corrected_by_its_features() {
     let adapter = Arc::new(calibrated().0);
     let (room, features) = served("hall");
     let mapped: Vec<FrameId> = (0..FRAMES as u32).step_by(2).map(FrameId).collect();
@@ -271,7 +271,7 @@ fn a_camera_that_leaves_the_room_is_not_tracked() {
     assert_eq!(update.status, Status::Tracking, "{}", update.reason);
 }
 
-/// A reader that knows where the camera is, to a centimetre and a hundredth of a radian.
+/// A reader that knows where the camera is, to a centimeter and a hundredth of a radian.
 struct Knowing(Vec<Pose>);
 
 impl PoseReader for Knowing {
@@ -290,7 +290,7 @@ fn the_localizer_of_a_room_gives_the_poses() {
     let (room, features) = served("hall");
     let truth = room.poses().to_vec();
 
-    // The map's own poses are off by a metre, so that only the reader can be right.
+    // The map's own poses are off by a meter, so that only the reader can be right.
     let mut shifted = truth.clone();
     for pose in &mut shifted {
         pose.translation.vector.x += 1.0;

@@ -21,7 +21,7 @@ use seese3_encoder::{decoding_cost, read_image_bytes, thumbnail};
 use seese3_robot::planning::PoseGraph;
 
 /// Maximum number of neighbors per frame.
-const MOST_NEIGHBOURS: usize = 32;
+const MOST_NEIGHBORS: usize = 32;
 
 /// Encoded size of a neighbor, at most, bytes.
 const NEIGHBOR_BYTES: usize = 80;
@@ -91,7 +91,7 @@ fn answer(
     let last = first.saturating_add(length).min(frame_count);
 
     let neighbors = match neighbors_within {
-        Some(_) => MOST_NEIGHBOURS * NEIGHBOR_BYTES,
+        Some(_) => MOST_NEIGHBORS * NEIGHBOR_BYTES,
         None => 0,
     };
     hold_for_answer(last.saturating_sub(first) * (frame_bytes(room) + neighbors))?;
@@ -107,7 +107,7 @@ fn answer(
         let mut wire = frame_to_wire(room, frame);
         if let Some(hop) = neighbors_within {
             wire.neighbors = graph
-                .neighbours(frame, hop, MOST_NEIGHBOURS)
+                .neighbors(frame, hop, MOST_NEIGHBORS)
                 .iter()
                 .map(|(frame, motion)| pb::NeighborFrame {
                     frame_id: frame.0,

@@ -323,7 +323,7 @@ fn room(snapshot: &Snapshot, served: &ServedRoom) -> pb::Room {
             .collect(),
         feature_sources: features.iter().map(convert::source_to_wire).collect(),
         format: provenance.format.clone(),
-        license: provenance.licence.clone(),
+        license: provenance.license.clone(),
         worst_rotation_error: provenance.worst_rotation_deviation,
         create_time: convert::time_to_wire(created),
         camera: provenance.camera.as_ref().map(convert::camera_to_wire),

@@ -56,10 +56,10 @@ pub fn pose_to_wire(pose: &Pose, room: &str) -> pb::Pose {
 }
 
 pub fn retrieved_to_wire(retrieved: &RetrievedFrame, room: &Room) -> pb::RetrievedFrame {
-    let frame = retrieved.neighbour.frame;
+    let frame = retrieved.neighbor.frame;
     pb::RetrievedFrame {
         frame_id: frame.0,
-        distance: retrieved.neighbour.distance,
+        distance: retrieved.neighbor.distance,
         pose: Some(pose_to_wire(&retrieved.pose, room.id().as_str())),
         frame_name: room
             .frame_names()

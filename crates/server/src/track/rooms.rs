@@ -87,9 +87,9 @@ impl TrackedRoom {
     }
 
     /// A stored frame as a wire message.
-    pub fn retrieved(&self, neighbor: seese3_core::index::Neighbour) -> pb::RetrievedFrame {
+    pub fn retrieved(&self, neighbor: seese3_core::index::Neighbor) -> pb::RetrievedFrame {
         let retrieved = RetrievedFrame {
-            neighbour: neighbor,
+            neighbor: neighbor,
             pose: self.room.poses()[neighbor.frame.row()],
         };
         convert::retrieved_to_wire(&retrieved, &self.room)

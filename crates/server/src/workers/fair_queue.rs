@@ -7,8 +7,8 @@
 //! starts, so the caller is charged the time of its previous job, and the difference when the job
 //! ends.
 //!
-//! Source: Demers, Keshav and Shenker, "Analysis and simulation of a fair queueing algorithm",
-//! 1989; start times from Goyal, Vin and Cheng, "Start-time fair queueing", 1996.
+//! Source: Demers, Keshav and Shenker, "Analysis and simulation of a fair queuing algorithm",
+//! 1989; start times from Goyal, Vin and Cheng, "Start-time fair queuing", 1996.
 
 use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::time::Duration;

@@ -196,7 +196,7 @@ async fn a_fitted_adapter_serves_no_other_room() {
 /// pose that it locates, the other room with that of its nearest frame; a latent has no feature to
 /// locate.
 #[tokio::test]
-async fn a_fitted_room_is_relocalised_by_its_own_adapter() {
+async fn a_fitted_room_is_relocalized_by_its_own_adapter() {
     let server = server().await;
     let (room, features) = served("hall");
     let ask = |view: Option<pb::View>| pb::RelocalizeRequest {

@@ -16,7 +16,7 @@ use crate::harness::{
 
 /// Oracle: the recorded poses, and a search of all pairs by the definition.
 #[tokio::test]
-async fn a_room_lists_its_frames_and_their_neighbours() {
+async fn a_room_lists_its_frames_and_their_neighbors() {
     const HOP: f64 = 0.05;
     let server = start(Config::default()).await;
     let room = room_of("synthetic", "synthetic");
@@ -41,14 +41,14 @@ async fn a_room_lists_its_frames_and_their_neighbours() {
         assert_eq!(found.neighbors.len(), expected.min(32), "frame {row}");
 
         let mut before = 0.0;
-        for neighbour in &found.neighbors {
-            let motion = convert::twist(neighbour.motion.as_ref().unwrap()).unwrap();
+        for neighbor in &found.neighbors {
+            let motion = convert::twist(neighbor.motion.as_ref().unwrap()).unwrap();
             let motion = Twist {
                 linear: motion.linear,
                 angular: motion.angular,
             };
             let there = poses[row] * exp(&motion);
-            let stored = poses[neighbour.frame_id as usize];
+            let stored = poses[neighbor.frame_id as usize];
             assert!((there.to_homogeneous() - stored.to_homogeneous()).norm() < 1e-9);
             assert!(motion.norm() >= before && motion.norm() <= HOP);
             before = motion.norm();
@@ -123,11 +123,11 @@ async fn frames_come_page_by_page() {
 /// The room `synthetic` again, as `pictured`, with images below a folder: of every three frames one
 /// is red, one green, and one has no file.
 fn pictured_room(folder: &std::path::Path) -> Room {
-    for (name, colour) in [("red.png", [250, 0, 0]), ("green.png", [0, 250, 0])] {
+    for (name, color) in [("red.png", [250, 0, 0]), ("green.png", [0, 250, 0])] {
         let picture = RgbImage {
             width: 64,
             height: 48,
-            bytes: colour.repeat(64 * 48),
+            bytes: color.repeat(64 * 48),
         };
         std::fs::write(folder.join(name), encode_png(&picture).unwrap()).unwrap();
     }

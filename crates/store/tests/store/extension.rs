@@ -82,7 +82,7 @@ async fn added_frames_follow_the_rooms_own() {
     assert_eq!(frames.numbers[259..262], [777, 778, 779]);
     assert_eq!(frames.held_out[259..261], [true, false]);
     assert!(frames.images.is_empty());
-    assert_eq!(back.room.provenance().licence, "CC0");
+    assert_eq!(back.room.provenance().license, "CC0");
     assert_eq!(
         back.room.provenance().camera,
         whole.provenance().camera,

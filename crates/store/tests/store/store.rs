@@ -86,13 +86,13 @@ async fn every_kind_of_adapter_comes_back_as_it_was() {
         ("corrected", 1, Mixing::Gate, CorrectorKind::ALL.to_vec()),
     ] {
         let mut plan = TrainingPlan::of(Preset::Steady, Split::Time, 20, 4);
-        let standardise = mixing == Mixing::Even;
+        let standardize = mixing == Mixing::Even;
 
         plan.config = TrainConfig {
             epochs: 3,
             charts,
             mixing,
-            standardise,
+            standardize,
             loss: Loss::Cosine,
             ..plan.config
         };
@@ -173,7 +173,7 @@ async fn publishing_the_same_poses_with_less_loses_nothing() {
         (whole.frame_numbers(), whole.timeline())
     );
 
-    assert_eq!(back.room.provenance().licence, "CC0");
+    assert_eq!(back.room.provenance().license, "CC0");
 
     assert_eq!(
         back.room.provenance().images_root,

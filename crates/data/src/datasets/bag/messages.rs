@@ -349,7 +349,7 @@ impl RosImage {
             }
         }
 
-        let colour = match bytes_per_pixel {
+        let color = match bytes_per_pixel {
             1 => ColorType::L8,
             3 => ColorType::Rgb8,
             _ => ColorType::Rgba8,
@@ -360,7 +360,7 @@ impl RosImage {
                 &pixels,
                 self.width,
                 self.height,
-                ExtendedColorType::from(colour),
+                ExtendedColorType::from(color),
             )
             .map_err(|error| format!("an image cannot be written as PNG: {error}"))?;
         Ok(ImageFile {

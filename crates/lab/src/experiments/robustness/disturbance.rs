@@ -194,7 +194,7 @@ impl Disturbance {
             }
             Self::Occluder { share } => occluded(picture, share, number),
             Self::Noise { deviation } => noisy(picture, deviation, number as u64),
-            Self::FieldOfView { share } => resampled(picture, |from_centre| from_centre * share),
+            Self::FieldOfView { share } => resampled(picture, |from_center| from_center * share),
             Self::Blank { brightness } => with_bytes(picture, |_, _| brightness),
         }
     }
@@ -212,13 +212,13 @@ fn turned(picture: &RgbImage, radians: f64) -> RgbImage {
 /// to the image center. Positions outside the image are clamped to its edge.
 fn resampled(picture: &RgbImage, source: impl Fn(Vector2<f64>) -> Vector2<f64>) -> RgbImage {
     let last = Vector2::new(picture.width as f64 - 1.0, picture.height as f64 - 1.0);
-    let centre = last / 2.0;
+    let center = last / 2.0;
 
     let mut bytes = Vec::with_capacity(picture.bytes.len());
     for y in 0..picture.height {
         for x in 0..picture.width {
-            let at = Vector2::new(x as f64, y as f64) - centre;
-            let from = source(at) + centre;
+            let at = Vector2::new(x as f64, y as f64) - center;
+            let from = source(at) + center;
             let from = Vector2::new(from.x.clamp(0.0, last.x), from.y.clamp(0.0, last.y));
             bytes.extend(bilinear(picture, from));
         }

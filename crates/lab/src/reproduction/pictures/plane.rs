@@ -39,7 +39,7 @@ impl Plane {
         }
     }
 
-    /// A camera's position in the plane, metres, and its heading, radians from the first axis.
+    /// A camera's position in the plane, meters, and its heading, radians from the first axis.
     pub fn place(&self, pose: &Pose) -> [f64; 3] {
         let on = |vector: Vector3<f64>| self.axes.map(|axis| axis.dot(&vector));
         let [x, y] = on(pose.translation.vector - self.middle);

@@ -33,7 +33,7 @@ pub fn add(section: &mut Section, data: &RoomData<'_>, adapter: &Adapter) -> Res
         let off_m = off(&truth, &laid);
         let title = format!("{}: {what}", data.room.id());
         let both = vec![series("true path", &truth), series(what, &laid)];
-        let picture = Figure::new(title, "metres", "metres", both).svg()?;
+        let picture = Figure::new(title, "meters", "meters", both).svg()?;
 
         let caption = format!(
             "The true path in its plane, and the two main directions of {what} laid over it: {off_m:.2} m off (root mean \
@@ -45,7 +45,7 @@ pub fn add(section: &mut Section, data: &RoomData<'_>, adapter: &Adapter) -> Res
     Ok(())
 }
 
-/// The positions of a recording in its principal plane, metres, shape (n, 2).
+/// The positions of a recording in its principal plane, meters, shape (n, 2).
 fn places(data: &RoomData<'_>) -> Array2<f64> {
     let poses = data.room.poses();
     let plane = Plane::of(poses);
@@ -81,14 +81,14 @@ fn off(truth: &Array2<f64>, rows: &Array2<f64>) -> f64 {
 
 /// Scores of the rows on their first two principal components, shape (n, 2).
 fn main_directions(rows: ArrayView2<'_, f64>) -> Array2<f64> {
-    let centred = &rows - &(rows.sum_axis(Axis(0)) / rows.nrows().max(1) as f64);
+    let centered = &rows - &(rows.sum_axis(Axis(0)) / rows.nrows().max(1) as f64);
 
     // Both Gram matrices have the same nonzero eigenvalues; decompose the smaller one.
-    let wide = centred.ncols() > centred.nrows();
+    let wide = centered.ncols() > centered.nrows();
     let gram = if wide {
-        centred.dot(&centred.t())
+        centered.dot(&centered.t())
     } else {
-        centred.t().dot(&centred)
+        centered.t().dot(&centered)
     };
     let eigen = SymmetricEigen::new(to_nalgebra(gram.view()));
 
@@ -101,7 +101,7 @@ fn main_directions(rows: ArrayView2<'_, f64>) -> Array2<f64> {
     let main = |which: usize, row: usize| match order.get(which) {
         None => 0.0,
         Some(&at) if wide => eigen.eigenvectors[(row, at)] * eigen.eigenvalues[at].max(0.0).sqrt(),
-        Some(&at) => centred
+        Some(&at) => centered
             .row(row)
             .iter()
             .enumerate()

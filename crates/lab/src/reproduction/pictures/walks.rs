@@ -52,10 +52,10 @@ pub struct WalkRecord {
     /// The length class of the pair.
     length: &'static str,
     frames: Vec<u32>,
-    metres_off: f64,
+    meters_off: f64,
     degrees_off: f64,
     /// Distance from source to target, the error of not moving; the angle follows.
-    metres: f64,
+    meters: f64,
     degrees: f64,
 }
 
@@ -107,9 +107,9 @@ pub fn add(
         room: data.room.id().to_string(),
         length: length.into(),
         frames: shown,
-        metres_off: off.translation_m,
+        meters_off: off.translation_m,
         degrees_off: off.rotation_rad.to_degrees(),
-        metres: still.translation_m,
+        meters: still.translation_m,
         degrees: still.rotation_rad.to_degrees(),
     })
 }
@@ -118,11 +118,11 @@ pub fn add(
 fn chosen(data: &RoomData<'_>, length: Length) -> Result<Pair, Error> {
     let mut pairs = Split::Whole.test_pairs(data.room.timeline(), FAR)?;
     let poses = data.room.poses();
-    let metres = |pair: &Pair| {
+    let meters = |pair: &Pair| {
         let [source, target] = [pair.source, pair.target].map(|frame| &poses[frame.row()]);
         PoseError::between(source, target).translation_m
     };
-    pairs.sort_by(|a, b| metres(a).total_cmp(&metres(b)));
+    pairs.sort_by(|a, b| meters(a).total_cmp(&meters(b)));
 
     let place = (length.share() * (pairs.len() - 1) as f64).round() as usize;
     Ok(pairs[place])
@@ -153,7 +153,7 @@ fn walked(navigator: &Navigator, pair: Pair) -> Result<Vec<u32>, Error> {
     let steps = answer
         .steps
         .iter()
-        .map(|step| step.frames[0].neighbour.frame.0);
+        .map(|step| step.frames[0].neighbor.frame.0);
     Ok([pair.source.0].into_iter().chain(steps).collect())
 }
 
