@@ -200,7 +200,7 @@ impl Encode {
             "room": self.room,
             "revision": revision,
             "features": features,
-            "encoded": encoded,
+            "encoded_count": encoded,
             "left_out": left_out,
         }))
     }

@@ -271,7 +271,7 @@ fn alignment_json(found: &MapAlignment) -> Value {
         "scale": found.map_from_other.scale,
         "frames": {"tried": tried, "located": located, "agreeing": agreeing},
         "residual_m": residual_m,
-        "residual_deg": residual_rad.to_degrees(),
+        "residual_rad": residual_rad,
     })
 }
 

@@ -72,7 +72,7 @@ pub fn report_json(report: &PoseReport, room: &Room, from: PosesFrom) -> Value {
     let warnings: Vec<String> = warnings.map(|warning| with_advice(warning, from)).collect();
     json!({
         "room": room.id().as_str(),
-        "frames": room.frame_count(),
+        "frame_count": room.frame_count(),
         "path": report.path.as_ref().map(path_json),
         "images": report.images.as_ref().map(images_json),
         "warnings": warnings,
@@ -288,7 +288,7 @@ fn images_json(images: &ImageReport) -> Value {
     json!({
         "verdict": verdict.name(),
         "explained": explained,
-        "pairs": pair_count,
+        "pair_count": pair_count,
         "likely": likely,
         "rows": rows,
         "translations": translations,

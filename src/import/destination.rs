@@ -351,7 +351,7 @@ impl Destination {
         let mut record = report_json(&report, &room, from);
         record["revision"] = json!(published.revision);
         record["created"] = json!(published.is_new);
-        record["dropped"] = json!(recording.dropped.len());
+        record["dropped_count"] = json!(recording.dropped.len());
         self.json.write(&record)
     }
 }

@@ -18,5 +18,6 @@ mod matched_views;
 mod program;
 mod research;
 mod rooms;
+mod schemas;
 #[cfg(feature = "otlp")]
 mod traces;

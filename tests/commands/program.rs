@@ -43,8 +43,23 @@ impl Place {
         format!("import numpy --name {room} --poses {poses} --features {features} --store store")
     }
 
+    /// What the program does. The JSON of a successful command has to be as documented.
+    #[track_caller]
     pub fn run(&self, arguments: &str) -> Output {
-        self.program(arguments).output().unwrap()
+        let output = self.program(arguments).output().unwrap();
+        let words: Vec<&str> = arguments.split_whitespace().collect();
+        let json = words.windows(2).find(|pair| pair[0] == "--json");
+        if let Some(&[_, file]) = json
+            && output.status.success()
+            && words[0] != "track"
+        {
+            let written = match file {
+                "-" => serde_json::from_slice(&output.stdout).unwrap(),
+                file => self.json(file),
+            };
+            crate::schemas::check(arguments, &written);
+        }
+        output
     }
 
     /// Starts the program without waiting for it.
