@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use anyhow::bail;
-use clap::{Args, Subcommand};
+use clap::Args;
 
 use super::encode::images_root;
 use super::output::say;
@@ -13,19 +13,6 @@ use seese3_data::pose_check::check_room;
 
 #[derive(Debug, Args)]
 pub struct Check {
-    #[command(subcommand)]
-    what: What,
-}
-
-#[derive(Debug, Subcommand)]
-enum What {
-    /// Check a room: its camera path, and whether its poses agree with its images. Fails if the
-    /// poses are wrong
-    Room(CheckRoom),
-}
-
-#[derive(Debug, Args)]
-struct CheckRoom {
     #[command(flatten)]
     common: StoreAndJson,
     /// Name of the room
@@ -38,13 +25,6 @@ struct CheckRoom {
 
 impl Check {
     pub async fn run(self) -> anyhow::Result<()> {
-        let What::Room(arguments) = self.what;
-        arguments.run().await
-    }
-}
-
-impl CheckRoom {
-    async fn run(self) -> anyhow::Result<()> {
         let store = self.common.open()?;
         let room = store.load_room(&self.room, None).await?.room;
 

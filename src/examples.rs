@@ -33,10 +33,8 @@ import bag
   seese3 import bag rosbag2_hall --store store --image-topic /camera/image/compressed --pose-topic /odom
   seese3 import bag drive.mcap --name hall --store store --world-frame map
 check
-  seese3 check room --store store --room kitchen
-check room
-  seese3 check room --store store --room kitchen
-  seese3 check room --store store --room kitchen --json - | jq .warnings
+  seese3 check --store store --room kitchen
+  seese3 check --store store --room kitchen --json - | jq .warnings
 export
   seese3 export numpy --store store --room kitchen --out kitchen-numpy
   seese3 export tum --store store --room kitchen --out kitchen.tum --rate 30

@@ -140,7 +140,8 @@ enum Command {
     /// For a video or photographs without poses, `python -m seese3.mapping` of the Python package
     /// estimates the poses and imports the room.
     Import(import::Import),
-    /// Check a stored room: its camera path, and whether its poses agree with its images
+    /// Check a stored room: its camera path, and whether its poses agree with its images. Fails if
+    /// the poses are wrong
     Check(check::Check),
     /// Write a stored room in a format that other programs read
     Export(export::Export),

@@ -177,7 +177,7 @@ impl Crop {
         let rows: Vec<usize> = (0..count).filter(is_kept).collect();
         if rows.is_empty() {
             bail!(
-                "no frame of room '{}' is left; see its positions with `seese3 check room`",
+                "no frame of room '{}' is left; see its positions with `seese3 check`",
                 self.common.room
             );
         }

@@ -1,4 +1,4 @@
-//! Prints the pose check of a room, at import and by `check room`, with the options that mend it.
+//! Prints the pose check of a room, at import and by `check`, with the options that mend it.
 
 use std::path::Path;
 

@@ -134,7 +134,7 @@ impl Train {
         };
 
         say(format_args!(
-            "{} training pairs, {} epochs, {judged}:",
+            "{} training pairs, {} epochs\n{judged}:",
             record.pair_count, record.config.epochs
         ));
 

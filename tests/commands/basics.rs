@@ -264,7 +264,7 @@ fn a_pushed_room_is_fitted_with_the_named_feature_set() {
         &["one of fourier, second"],
     );
     here.refuses(
-        &format!("catalog rooms/r --server {}", server.address),
+        &format!("localize --room r --frame 0 --server {}", server.address),
         &["'r' is not served"],
     );
     here.prints(

@@ -20,7 +20,7 @@ fn json_on_standard_output_stands_alone() {
         "evaluate --store store --room r",
         "store list --store store",
         "store verify --store store",
-        "check room --store store --room r",
+        "check --store store --room r",
         "fit --store store --room r",
         "encoders",
         "export kitti --store store --room r --out exported",

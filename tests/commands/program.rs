@@ -48,14 +48,14 @@ impl Place {
     pub fn run(&self, arguments: &str) -> Output {
         let output = self.program(arguments).output().unwrap();
         let words: Vec<&str> = arguments.split_whitespace().collect();
-        let json = words.windows(2).find(|pair| pair[0] == "--json");
-        if let Some(&[_, file]) = json
+        let json = words.iter().position(|&word| word == "--json");
+        if let Some(place) = json
             && output.status.success()
             && words[0] != "track"
         {
-            let written = match file {
-                "-" => serde_json::from_slice(&output.stdout).unwrap(),
-                file => self.json(file),
+            let written = match words.get(place + 1) {
+                Some(file) if !file.starts_with('-') => self.json(file),
+                _ => serde_json::from_slice(&output.stdout).unwrap(),
             };
             crate::schemas::check(arguments, &written);
         }

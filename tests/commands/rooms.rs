@@ -373,7 +373,7 @@ fn inverted_poses_are_named_at_import_and_by_check() {
         assert!(output.status.success());
         said(&output)
     };
-    let check = |room: &str| here.run(&format!("check room --store store --room {room} --json"));
+    let check = |room: &str| here.run(&format!("check --store store --room {room} --json"));
 
     // The camera is on a tripod, which is said, and nothing else.
     let is_clean = |warned: &str| {

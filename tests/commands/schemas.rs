@@ -15,7 +15,7 @@ pub fn check(arguments: &str, written: &Value) {
     let words: Vec<&str> = arguments.split_whitespace().collect();
     let schemas = closed_schemas();
     let commands = &schemas["$defs"]["commands"];
-    let names = [words[..2].join(" "), words[0].to_owned()];
+    let names = [words[..words.len().min(2)].join(" "), words[0].to_owned()];
     let Some(name) = names.iter().find(|name| commands.get(name).is_some()) else {
         assert!(
             OTHERS.contains(&words[0]),

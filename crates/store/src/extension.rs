@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-use ndarray::{Axis, concatenate, s};
+use ndarray::{Axis, concatenate};
 
 use super::room_keypoints::RoomKeypoints;
 use super::room_publishing::{PublishPolicy, RoomContents};
@@ -58,7 +58,7 @@ impl Store {
     ///
     /// # Errors
     /// [`Error::Unknown`] if there is no such room, [`Error::CannotAdd`] if the frames are not
-    /// compatible with its own, otherwise as [`check_features`] and [`Store::load_room`].
+    /// compatible with its own or it already has a part of them, otherwise as [`check_features`] and [`Store::load_room`].
     pub async fn extended_room(
         &self,
         addition: RoomContents<'_>,
@@ -74,7 +74,7 @@ impl Store {
     }
 
     /// Extends the newest revision of a room, as [`Store::extended_room`], and publishes the
-    /// result. Frames that the room already has as a contiguous run are not added again.
+    /// result. If the room already has all of the frames, one after the other, nothing is published.
     ///
     /// # Errors
     /// As [`Store::extended_room`] and [`Store::publish_room`].
@@ -147,7 +147,10 @@ pub(super) fn extended(
 
     let features =
         joined_features(base, added_features, others).map_err(|problem| refused(problem.into()))?;
-    if let Some(rows) = known_rows(base, addition, &features) {
+    let is_known = |row, added| same_frame(base, row, addition, added, &features);
+    if features.len() == base.features.len()
+        && let Some(rows) = known_rows(base, addition, is_known)
+    {
         let is_there = added_keypoints
             .is_none_or(|added| has_keypoints(base.keypoints.as_ref(), rows.clone(), added));
         let keypoints = if is_there {
@@ -163,6 +166,12 @@ pub(super) fn extended(
             base: base.revision,
             is_there,
         });
+    }
+    if let Some(repeated) = first_repeated(base, addition, is_known) {
+        let problem = format!(
+            "the room already has some of these frames, the first in row {repeated}: send only the others"
+        );
+        return Err(refused(problem.into()));
     }
     let frames = joined_frames(base.room.frames(), addition.frames())
         .map_err(|problem| refused(problem.into()))?;
@@ -368,34 +377,50 @@ fn place_among(known: &[Features], added: &FeatureSource) -> Result<usize, Strin
     }
 }
 
-/// Where the base already has the added frames as a contiguous run, with the same poses, times and
+/// Whether frame `row` of the base and frame `added` of the addition have the same pose, time and
 /// features. `joined` has the rows of both.
-fn known_rows(base: &StoredRoom, addition: &Room, joined: &[Features]) -> Option<Range<usize>> {
-    let known = base.room.frame_count();
-    let added = addition.frame_count();
-    if joined.len() != base.features.len() || added > known {
-        return None;
-    }
-
+fn same_frame(
+    base: &StoredRoom,
+    row: usize,
+    addition: &Room,
+    added: usize,
+    joined: &[Features],
+) -> bool {
     // Reading projects stored rotations, so equal ones agree only up to rounding.
-    let same = |a: &Pose, b: &Pose| (a.to_homogeneous() - b.to_homogeneous()).amax() < 1e-12;
-    let begins_at = |first: usize| {
-        let times = base.room.timestamps_ns().get(first..first + added);
-        if times.unwrap_or_default() != addition.timestamps_ns() {
-            return false;
-        }
-
-        let poses = &base.room.poses()[first..first + added];
-        let same_rows = |set: &Features| {
-            let rows = set.rows();
-            rows.slice(s![first..first + added, ..]) == rows.slice(s![known.., ..])
-        };
-        let mut pairs = poses.iter().zip(addition.poses());
-        pairs.all(|(a, b)| same(a, b)) && joined.iter().all(same_rows)
+    let same_pose = |a: &Pose, b: &Pose| {
+        (a.translation.vector - b.translation.vector).amax() < 1e-12
+            && (a.to_homogeneous() - b.to_homogeneous()).amax() < 1e-12
+    };
+    let same_rows = |set: &Features| {
+        let rows = set.rows();
+        rows.row(row) == rows.row(base.room.frame_count() + added)
     };
 
-    let first = (0..=known - added).find(|&first| begins_at(first))?;
+    base.room.timestamps_ns().get(row) == addition.timestamps_ns().get(added)
+        && same_pose(&base.room.poses()[row], &addition.poses()[added])
+        && joined.iter().all(same_rows)
+}
+
+/// Where the base already has all added frames, one after the other.
+fn known_rows(
+    base: &StoredRoom,
+    addition: &Room,
+    is_known: impl Fn(usize, usize) -> bool,
+) -> Option<Range<usize>> {
+    let added = addition.frame_count();
+    let last = base.room.frame_count().checked_sub(added)?;
+    let first = (0..=last).find(|first| (0..added).all(|row| is_known(first + row, row)))?;
     Some(first..first + added)
+}
+
+/// The first added row that the base already has.
+fn first_repeated(
+    base: &StoredRoom,
+    addition: &Room,
+    is_known: impl Fn(usize, usize) -> bool,
+) -> Option<usize> {
+    let known = base.room.frame_count();
+    (0..addition.frame_count()).find(|&added| (0..known).any(|row| is_known(row, added)))
 }
 
 /// Every column of the known frames, with that of the added frames appended.

@@ -129,7 +129,7 @@ pub struct MotionBaselines {
     pub baselines: Baselines,
 }
 
-/// The adapter's and the constant's R² of motions, as one line of text.
+/// The adapter's and the constant's R² of motions, as text.
 pub fn baselines_text(found: &MotionBaselines) -> String {
     let Baselines {
         constant_r2,
@@ -148,12 +148,13 @@ pub fn baselines_text(found: &MotionBaselines) -> String {
     let verdict = if found.baselines.can_tell() {
         ""
     } else {
-        "; the constant is so far below 0 that these pairs cannot rate the adapter"
+        "\nthe constant is so far below 0 that these pairs cannot rate the adapter"
     };
 
     format!(
-        "R² of motions {:.3}; of the mean training motion {constant_r2:.3} (variance ratio of test to training \
-         motions {variance_ratio:.2}{nearest}; {optimizer_steps} optimizer steps){verdict}",
+        "R² of motions {:.3}; of the mean training motion {constant_r2:.3}\n\
+         (variance ratio of test to training motions {variance_ratio:.2}{nearest}; \
+         {optimizer_steps} optimizer steps){verdict}",
         found.motion.overall
     )
 }

@@ -77,7 +77,7 @@ pub fn training_remark(runs: &[TrainingRun]) -> Option<String> {
         "the constant is so far below 0 that they cannot rate the adapter; try another --split"
     };
     Some(format!(
-        "the mean training motion predicts these pairs better (R² {constant:.3} against {read:.3}): {verdict}"
+        "the mean training motion predicts these pairs better (R² {constant:.3} against {read:.3}):\n{verdict}"
     ))
 }
 

@@ -58,6 +58,7 @@ impl Handlers {
         let answer = |defaults| pb::SetDefaultResponse { defaults };
         self.change_default(caller, identity, choice, validate_only, answer)
             .await
+            .map_err(|error| error.within("default"))
     }
 
     pub(super) async fn clear(

@@ -253,3 +253,33 @@ async fn frames_that_are_added_at_the_same_time_are_all_there() {
     sequences.dedup();
     assert_eq!(sequences, [0, 1, 2, 3, 4]);
 }
+
+/// Oracle: the contract: an upload that repeats a part of the room is refused, whichever part, and
+/// names the first repeated row; nothing is stored twice.
+#[tokio::test]
+async fn an_overlap_is_refused() {
+    let (_folder, store) = begun().await;
+    for (range, repeated) in [(250..270, "row 0"), (255..262, "row 0")] {
+        let features = [rows("f", 1.0, range.clone()), rows("g", 2.0, range.clone())];
+        let addition = part(range);
+        let contents = RoomContents::of(&addition, &features);
+        let answer = store.extend_room(contents, OtherFeatures::Required).await;
+        let Err(Error::CannotAdd { problem, .. }) = answer else {
+            panic!("{answer:?}");
+        };
+        assert!(problem.to_string().contains(repeated), "{problem}");
+    }
+
+    // Other features at the same poses and times are other frames.
+    let features = [rows("f", 3.0, 250..270), rows("g", 2.0, 250..270)];
+    let addition = part(250..270);
+    let contents = RoomContents::of(&addition, &features);
+    store
+        .extend_room(contents, OtherFeatures::Required)
+        .await
+        .unwrap();
+    assert_eq!(
+        store.load_room("a", None).await.unwrap().room.frame_count(),
+        280
+    );
+}
