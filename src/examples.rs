@@ -7,7 +7,7 @@ const EXIT_CODES: &str = "Exit codes:\n  \
     0    done\n  \
     1    failed; the last line on standard error gives the cause and the remedy\n  \
     2    invalid command line\n  \
-    130  stopped by Ctrl-C\n\n\
+    130  stopped by Ctrl-C (serve: 0)\n\n\
     NO_COLOR=1 turns colors off. Progress goes to standard error: a bar on a terminal, otherwise a line\n\
     every 30 s; --quiet turns it off.";
 
@@ -143,7 +143,7 @@ localize
   seese3 localize --room kitchen --image photo.jpg
   seese3 localize --feature-file features.npy --row 7 --top-k 3 --json -
 relocalize
-  seese3 relocalize --images before.jpg,now.jpg
+  seese3 relocalize --images before.jpg,now.jpg --camera mapping
   seese3 relocalize --room kitchen --feature-file features.npy --rows 3,4,5
 motion
   seese3 motion --images a.jpg,b.jpg --camera 640x480,525

@@ -59,6 +59,7 @@ impl Pull {
                     adapter_revision: self.name.revision,
                 };
                 let (adapter, weights) = client.download_adapter(request).await?;
+                self.check_answer(adapter.revision.as_ref())?;
                 let store = Store::create(&self.store)?;
                 let published =
                     store.upload_adapter_files(&target.name, &adapter.manifest, weights, policy);
@@ -88,6 +89,7 @@ impl Pull {
                 |room: Option<ReceivedRoom>| room.context("the download has no first message");
             match received.message {
                 Some(Message::Room(first)) => {
+                    self.check_answer(first.revision.as_ref())?;
                     let mut upload = first.upload.context("the download has no description")?;
                     upload.room.clone_from(&target.name);
                     room = Some(ReceivedRoom::begin(&upload)?);
@@ -107,6 +109,24 @@ impl Pull {
         };
         client.download_room(request, take).await?;
         complete.context("the download ended early; pull again")
+    }
+
+    /// Checks that the server sends what was asked for.
+    fn check_answer(&self, sent: Option<&pb::Revision>) -> anyhow::Result<()> {
+        let sent = sent.context("the download does not state its revision")?;
+        if sent.name != self.name.name
+            || self
+                .name
+                .revision
+                .is_some_and(|asked| asked != sent.revision)
+        {
+            bail!(
+                "the server sends '{}' revision {}",
+                sent.name,
+                sent.revision
+            );
+        }
+        Ok(())
     }
 
     fn report(

@@ -15,7 +15,8 @@ use seese3_client::proto::v1 as pb;
 pub struct Localize {
     #[command(flatten)]
     server: Server,
-    /// A room to search; all rooms that the adapter serves if omitted; may be given several times
+    /// A room to search; may be given several times. If omitted, all rooms that the adapter serves
+    /// and, for images, all rooms with keypoints
     #[arg(long = "room")]
     rooms: Vec<String>,
     /// Name of the adapter. If omitted: with one room, as for `navigate`; otherwise the only one that

@@ -36,8 +36,8 @@ pub struct Server {
     /// The server's address, HOST:PORT
     #[arg(long, env = "SEESE3_SERVER", default_value = "127.0.0.1:50051")]
     server: String,
-    /// Deadline of each call, seconds, 1 to 86400; for `track`, only of opening the stream; for
-    /// `push`, the longest time without progress
+    /// Deadline of each call, seconds, 1 to 86400. For `push` and `pull`, it is the longest time without
+    /// progress; for `track`, it limits only the opening of the stream
     #[arg(long, default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     deadline: u64,
     /// File with the authentication token for the server

@@ -16,10 +16,12 @@ use seese3_client::proto::v1 as pb;
 pub struct Relocalize {
     #[command(flatten)]
     server: Server,
-    /// A room to search; all rooms that the adapter serves if omitted; may be given several times
+    /// A room to search; may be given several times. If omitted, all rooms that the adapter serves
+    /// and, for images, all rooms with keypoints
     #[arg(long = "room")]
     rooms: Vec<String>,
-    /// Name of the adapter; may be omitted when only one that can track serves the rooms
+    /// Name of the adapter. If omitted: in one room, its default among the adapters that can track;
+    /// in several rooms, the only one that can. Images of rooms with keypoints need none
     #[arg(long, default_value = "", hide_default_value = true)]
     adapter: String,
     /// JPEG or PNG files, A,B,…: views of one camera that hardly moves between them, the newest

@@ -32,11 +32,11 @@ pub struct Planning {
     hold_out: HoldOut,
     /// Number of queries in each room, 1 to 100000
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
-    questions: u32,
+    queries: u32,
     /// Maximum hop length, meters and radians mixed; if omitted, the root mean square of the
     /// motions that the adapter was trained on
     #[arg(long, value_parser = positive)]
-    step: Option<f64>,
+    max_hop_length: Option<f64>,
     /// Fit an adapter to each room's mapped frames, initialized from --adapter, and localize the
     /// views with it
     #[arg(long)]
@@ -64,8 +64,8 @@ impl Planning {
         let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
         let protocol = PlanningProtocol {
             hold_out: self.hold_out,
-            questions: self.questions as usize,
-            longest_hop: self.step,
+            questions: self.queries as usize,
+            longest_hop: self.max_hop_length,
             seed: self.seed,
             is_fitted: self.fit,
         };
@@ -77,7 +77,7 @@ impl Planning {
         say(format_args!(
             "{} rooms, {} queries in each, adapter '{}' revision {}, hold-out {}",
             found.len(),
-            self.questions,
+            self.queries,
             stored.name,
             stored.revision,
             self.hold_out.name(),

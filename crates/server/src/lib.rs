@@ -364,7 +364,7 @@ pub async fn run(
     let (stop, stopped) = oneshot::channel::<()>();
     let workers = Workers::new(&config);
     let (reload_handle, reload_requests) = ReloadHandle::new();
-    let changes = Changes::new(store.clone(), reload_handle, &config);
+    let changes = Changes::new(store.clone(), watched.clone(), reload_handle, &config);
 
     let handlers = Handlers {
         phase: watched.clone(),

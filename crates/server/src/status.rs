@@ -8,6 +8,9 @@ use tonic_types::{ErrorDetails, StatusExt};
 use seese3_core::room::FrameId;
 use seese3_core::{adapter, cancel, eval, navigation, room, splits};
 
+/// The longest name of a room or an adapter, bytes.
+const LONGEST_NAME: usize = 100;
+
 /// Minimum similarity, 0 to 1, for suggesting a served name: one wrong letter in four.
 const NEARLY: f64 = 0.75;
 
@@ -170,9 +173,14 @@ impl Error {
         name: &str,
         served: impl IntoIterator<Item = &'a String>,
     ) -> Self {
+        // The comparison takes time in proportion to the length, and the answer repeats the name.
+        let is_long = name.len() > LONGEST_NAME;
+        let shown: String = name.chars().take(LONGEST_NAME).collect();
+        let name = shown.as_str();
         let likeness = |served: &String| strsim::normalized_damerau_levenshtein(served, name);
         let nearest = served
             .into_iter()
+            .filter(|_| !is_long)
             .map(|served| (likeness(served), served))
             .filter(|(likeness, _)| *likeness >= NEARLY)
             .max_by(|a, b| a.0.total_cmp(&b.0));
@@ -190,7 +198,10 @@ impl Error {
         Self::NotFound {
             field: field.to_owned(),
             missing: Missing::of(kind, name),
-            problem: format!("'{name}' is not served{remedy}"),
+            problem: match is_long {
+                true => format!("'{name}…' is not served; names have at most {LONGEST_NAME} bytes"),
+                false => format!("'{name}' is not served{remedy}"),
+            },
         }
     }
 

@@ -127,6 +127,11 @@ impl Store {
         policy: Option<UploadPolicy>,
     ) -> Result<Published, Error> {
         let folder = folder_of(Kind::Adapter, name);
+        // A refused upload writes nothing.
+        if policy == Some(UploadPolicy::Replace) {
+            self.check_adapter_upload(name, UploadPolicy::Replace)
+                .await?;
+        }
 
         let body = AdapterBody {
             adapter: name.to_owned(),

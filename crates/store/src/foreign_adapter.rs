@@ -14,7 +14,7 @@ use seese3_core::adapter::{
 };
 use seese3_core::features::FeatureSource;
 use seese3_core::motion_scores::MotionScores;
-use seese3_core::room::RoomId;
+use seese3_core::room::{RoomId, is_plain_name};
 use seese3_core::splits::Split;
 
 /// The value of `format` in the description.
@@ -99,6 +99,15 @@ pub fn read_foreign_adapter(description: &[u8], weights: &[u8]) -> Result<Foreig
         deviation: vector6(&tensors, "target.deviation", WEIGHTS)?,
     };
     let features = tensors.f32("features")?;
+    if features.is_empty() {
+        let problem = "'features' has no rows: give some training features, at least one row";
+        return Err(damaged(WEIGHTS, problem.into()));
+    }
+    let name = &described.feature_source.name;
+    if !is_plain_name(name) {
+        let problem = format!("'feature_source.name': '{name}' is no name of a feature set");
+        return Err(damaged(DESCRIPTION, problem.into()));
+    }
     let config = TrainConfig {
         epochs: described.epochs,
         seed: described.seed,

@@ -290,6 +290,10 @@ impl Store {
         check_features(room, features)?;
         check_keypoints(room, keypoints)?;
         let folder = folder_of(Kind::Room, room.id().as_str());
+        // A refused upload writes nothing.
+        if let PublishPolicy::Upload(policy) = over {
+            self.check_upload(room, policy).await?;
+        }
         let publication = Publication::begin(self, Some(room.id().as_str())).await?;
 
         // A repeated import, for instance without images, must not lose stored data: missing
@@ -562,6 +566,8 @@ impl Store {
         // object, so that comparing revisions by checksum still finds equal frames.
         let object = (columns(&frames) == columns(before)).then_some(body.frames);
         let mut provenance = room.provenance().clone();
+        // It is of the matrices that were given, not of the poses, which are the same.
+        provenance.worst_rotation_deviation = known.provenance().worst_rotation_deviation;
         if provenance.license.is_empty() {
             provenance.license.clone_from(&known.provenance().license);
         }

@@ -7,7 +7,7 @@ use std::sync::{self, Arc, PoisonError};
 
 use prost::Message;
 use sha2::{Digest, Sha256};
-use tokio::sync::Mutex;
+use tokio::sync::{Mutex, watch};
 use tracing::Instrument;
 
 use super::super::caller::{CallerId, Requester};
@@ -29,6 +29,8 @@ const MOST_WAITING: usize = 64;
 /// State shared by all catalog changes.
 pub struct Changes {
     pub store: Store,
+    /// What is served.
+    phase: watch::Receiver<Phase>,
     /// What may be stored of each room.
     quota: Quota,
     reload: ReloadHandle,
@@ -43,9 +45,15 @@ pub struct Changes {
 }
 
 impl Changes {
-    pub fn new(store: Store, reload: ReloadHandle, config: &Config) -> Self {
+    pub fn new(
+        store: Store,
+        phase: watch::Receiver<Phase>,
+        reload: ReloadHandle,
+        config: &Config,
+    ) -> Self {
         Self {
             store,
+            phase,
             quota: config.room_quota,
             reload,
             recent: Arc::default(),
@@ -92,6 +100,7 @@ impl Changes {
                     return A::decode(answer).map_err(|_| Error::Internal);
                 }
 
+                changes.check_store().await?;
                 let made = on_blocking_thread(change).await??;
                 changes.reload.now().await;
                 let answer = answer(made);
@@ -118,7 +127,28 @@ impl Changes {
         check: impl Future<Output = Result<T, Error>> + Send + 'static,
     ) -> Result<T, Error> {
         let _place = self.place(caller)?;
+        self.check_store().await?;
         on_blocking_thread(check).await?
+    }
+
+    /// Refuses changes of a store that has disappeared, for instance with its disk: a change would
+    /// make a new one in its place, without what is served.
+    async fn check_store(&self) -> Result<(), Error> {
+        let serves = match &*self.phase.borrow() {
+            Phase::Serving(snapshot) => {
+                !snapshot.rooms().is_empty() || !snapshot.adapters().is_empty()
+            }
+            _ => false,
+        };
+        for kind in [Kind::Room, Kind::Adapter] {
+            if !serves || self.store.remembers(kind).await? {
+                return Ok(());
+            }
+        }
+        Err(Error::Precondition(
+            "the store has disappeared: its folder was moved, removed or unmounted; nothing was changed"
+                .to_owned(),
+        ))
     }
 
     /// A place among the queued changes.

@@ -277,3 +277,28 @@ async fn a_map_pose_of_track_is_accepted() {
         "motion.target_pose.parent_frame",
     );
 }
+
+/// Oracle: the contract: no change is made in a store that has disappeared, and what was served is
+/// still served; nor is anything made in its place.
+#[tokio::test]
+async fn a_store_that_disappeared_takes_no_changes() {
+    let (folder, store) = filled_store().await;
+    let config = Config {
+        writable: true,
+        ..Config::default()
+    };
+    let server = start_on(folder, store, config).await;
+    let root = server.folder.path();
+    let away = tempfile::tempdir().unwrap();
+    for entry in std::fs::read_dir(root).unwrap() {
+        let entry = entry.unwrap();
+        std::fs::rename(entry.path(), away.path().join(entry.file_name())).unwrap();
+    }
+
+    let answer = upload("here").send(&server.client).await;
+    let error = answer.map(drop).unwrap_err();
+    assert!(error.to_string().contains("has disappeared"), "{error}");
+    assert!(server.client.room("synthetic").await.is_ok());
+    let left: Vec<_> = std::fs::read_dir(root).unwrap().collect();
+    assert!(left.is_empty(), "{left:?}");
+}

@@ -484,7 +484,10 @@ async fn batches_and_the_catalog_name_the_field() {
     asked.refuses(InvalidArgument, &invalid).await;
 
     let long_name = "x".repeat(100_000);
-    refused("long name", client.room(&long_name).await, NotFound, "room");
+    let answer = client.room(&long_name).await;
+    let message = answer.as_ref().unwrap_err().to_string();
+    assert!(message.len() < 300, "{} bytes", message.len());
+    refused("long name", answer, NotFound, "room");
     refused(
         "unknown adapter",
         client.adapter("x").await,

@@ -741,3 +741,37 @@ async fn other_frames_are_not_published_by_accident() {
     let replaced = store.publish_room(&other, &[set("f", 1.0)]).await.unwrap();
     assert_eq!(replaced.revision, 3);
 }
+
+/// Oracle: the contract: an upload that is refused writes nothing.
+#[tokio::test]
+async fn a_refused_upload_leaves_no_objects() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = Store::create(folder.path().to_str().unwrap()).unwrap();
+    let room = seese3_testing::recording::room("a");
+    let contents = seese3_store::RoomContents::of(&room, &[]);
+    let policy = seese3_store::UploadPolicy::Replace;
+    let refused = store.upload_contents(contents, policy).await;
+    assert!(refused.is_err(), "{refused:?}");
+    assert!(!folder.path().join("rooms").exists());
+}
+
+/// Oracle: the contract: the same poses and features are the same content, however exact the
+/// matrices were that the poses were read from.
+#[tokio::test]
+async fn rounded_matrices_are_no_other_content() {
+    use seese3_core::room::{Provenance, Room};
+
+    let folder = tempfile::tempdir().unwrap();
+    let store = Store::create(folder.path().to_str().unwrap()).unwrap();
+    let room = seese3_testing::recording::room("a");
+    store.publish_room(&room, &[]).await.unwrap();
+    let origin = Provenance {
+        worst_rotation_deviation: 1e-7,
+        ..room.provenance().clone()
+    };
+    let rounded = Room::new(room.id().clone(), room.frames().clone(), origin).unwrap();
+    let contents = seese3_store::RoomContents::of(&rounded, &[]);
+    let policy = seese3_store::UploadPolicy::Create;
+    let published = store.upload_contents(contents, policy).await.unwrap();
+    assert!(!published.is_new);
+}
