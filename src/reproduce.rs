@@ -151,8 +151,8 @@ impl Reproduce {
         self.json.write(&record)
     }
 
-    /// What a run depends on: the program, the options, and the revisions of the rooms. Only a run of
-    /// the same identity goes on where another one stopped.
+    /// What a run depends on: the program, the options, and the revisions of the rooms. Only a run
+    /// of the same identity goes on where another one stopped.
     fn identity(&self, sets: &[LoadedSet]) -> anyhow::Result<Value> {
         let rooms = |rooms: &[Loaded]| -> Vec<String> {
             let named = rooms.iter().map(|(stored, features)| {

@@ -64,8 +64,8 @@ pub struct Serve {
         requires = "tls_cert"
     )]
     tls_client_ca: Option<PathBuf>,
-    /// Maximum number of connections, 1 to 1000000; with --auth-file, callers divide them, otherwise
-    /// further ones are closed at once
+    /// Maximum number of connections, 1 to 1000000; with --auth-file, callers divide them,
+    /// otherwise further ones are closed at once
     #[arg(long, env = "SEESE3_MAX_CONNECTIONS", default_value_t = Config::default().connections, value_parser = bounded(1, 1_000_000))]
     max_connections: usize,
     /// Index for the nearest-frame search

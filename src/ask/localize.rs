@@ -19,12 +19,12 @@ pub struct Localize {
     /// and, for images, all rooms with keypoints
     #[arg(long = "room")]
     rooms: Vec<String>,
-    /// Name of the adapter. If omitted: with one room, as for `navigate`; otherwise the only one that
-    /// serves all the rooms; adapters fitted to one room do not count
+    /// Name of the adapter. If omitted: with one room, as for `navigate`; otherwise the only one
+    /// that serves all the rooms; adapters fitted to one room do not count
     #[arg(long, default_value = "", hide_default_value = true)]
     adapter: String,
-    /// Use this stored frame as the view: a row of the room, counted from 0; exactly one room must be
-    /// searched
+    /// Use this stored frame as the view: a row of the room, counted from 0; exactly one room must
+    /// be searched
     #[arg(long, conflicts_with_all = ["feature_file", "image"])]
     frame: Option<u32>,
     #[command(flatten)]

@@ -36,8 +36,8 @@ pub struct Server {
     /// The server's address, HOST:PORT
     #[arg(long, env = "SEESE3_SERVER", default_value = "127.0.0.1:50051")]
     server: String,
-    /// Deadline of each call, seconds, 1 to 86400. For `push` and `pull`, it is the longest time without
-    /// progress; for `track`, it limits only the opening of the stream
+    /// Deadline of each call, seconds, 1 to 86400. For `push` and `pull`, it is the longest time
+    /// without progress; for `track`, it limits only the opening of the stream
     #[arg(long, default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     deadline: u64,
     /// File with the authentication token for the server
@@ -215,8 +215,8 @@ fn feature_view(file: &Path, row: usize) -> anyhow::Result<pb::View> {
         );
     }
 
-    // A NumPy file does not name its features, so the name of the set stays empty and the server can
-    // only check the width.
+    // A NumPy file does not name its features, so the name of the set stays empty and the server
+    // can only check the width.
     let feature = pb::Feature {
         values: features.row(row).to_vec(),
         feature_set: String::new(),

@@ -19,8 +19,8 @@ pub struct Plan {
     /// Name of the room to plan in
     #[arg(long)]
     room: String,
-    /// Name of the adapter. If omitted: the room's default (`seese3 store default`), else one fitted
-    /// to the room, else one trained in it, else the newest that serves it
+    /// Name of the adapter. If omitted: the room's default (`seese3 store default`), else one
+    /// fitted to the room, else one trained in it, else the newest that serves it
     #[arg(long, default_value = "", hide_default_value = true)]
     adapter: String,
     /// Start at this frame of the room (its row, counted from 0)

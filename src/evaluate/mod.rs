@@ -116,8 +116,9 @@ struct Navigation {
     /// Name of its feature set; by default the one that the adapter was trained on
     #[arg(long)]
     features: Option<String>,
-    /// Name of the adapter; by default the one set for the room, else one that was trained in the room,
-    /// else the newest, if the test pairs are held out from it. An adapter from `fit` must be named
+    /// Name of the adapter; by default the one set for the room, else one that was trained in the
+    /// room, else the newest, if the test pairs are held out from it. An adapter from `fit` must be
+    /// named
     #[arg(long)]
     adapter: Option<String>,
     /// Frames from the source to the target of a pair; by default as the adapter was trained

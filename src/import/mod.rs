@@ -45,7 +45,8 @@ enum Format {
     /// 7-Scenes: a scene's folder (seq-XX/frame-XXXXXX.pose.txt), or one sequence's
     #[command(name = "7scenes")]
     SevenScenes(Seven),
-    /// Your own folder: images/, and poses.npy (n, 4, 4) or (n, 3, 4) in the order of the image names
+    /// Your own folder: images/, and poses.npy (n, 4, 4) or (n, 3, 4) in the order of the image
+    /// names
     Folder(Plain),
     /// COLMAP: a model (cameras and images, .bin or .txt), or a project's folder with sparse/0
     Colmap(Colmap),

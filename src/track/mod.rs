@@ -28,12 +28,13 @@ const WAITING: usize = 32;
 pub struct Track {
     #[command(flatten)]
     server: Server,
-    /// Name of the room; if omitted, the server finds it among all rooms that the adapter serves or,
-    /// for images if no adapter can track, among all rooms with keypoints
+    /// Name of the room; if omitted, the server finds it among all rooms that the adapter serves
+    /// or, for images if no adapter can track, among all rooms with keypoints
     #[arg(long)]
     room: Option<String>,
-    /// Name of the adapter. If omitted: in a named room, the first by the rule of `navigate` that can
-    /// track; without a room, the only one that can. If none can, images are tracked by keypoints
+    /// Name of the adapter. If omitted: in a named room, the first by the rule of `navigate` that
+    /// can track; without a room, the only one that can. If none can, images are tracked by
+    /// keypoints
     #[arg(long)]
     adapter: Option<String>,
     /// A NumPy file of features, shape (n, d), one row per frame

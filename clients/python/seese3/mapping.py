@@ -173,7 +173,7 @@ def map_room(
     model.write(str(scaled))
 
     _say("5. import")
-    command: list[object] = ["import", "colmap", scaled, "--images", images, "--room", room, "--store", store]
+    command: list[object] = ["import", "colmap", scaled, "--images", images, "--name", room, "--store", store]
     command += ["--scale", "1"]
     if times:
         file = out / "times.txt"

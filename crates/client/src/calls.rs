@@ -61,8 +61,8 @@ impl Pages {
     /// Goes on to the page of `token`. Returns whether there is one.
     ///
     /// # Errors
-    /// [`Error::EndlessList`] if the list has no end: a token that comes twice in a row, or more than
-    /// [`MOST_PAGES`].
+    /// [`Error::EndlessList`] if the list has no end: a token that comes twice in a row, or more
+    /// than [`MOST_PAGES`].
     fn go_on(&mut self, token: String) -> Result<bool, Error> {
         if token.is_empty() {
             return Ok(false);
@@ -308,8 +308,8 @@ impl Client {
         Ok(self.in_time(service.get_room(request)).await?.into_inner())
     }
 
-    /// A room's frames, features and keypoints. `take` is called for each message; its error ends the
-    /// download.
+    /// A room's frames, features and keypoints. `take` is called for each message; its error ends
+    /// the download.
     ///
     /// # Errors
     /// [`Error::Refused`], [`Error::Deadline`] if no message comes for as long as the deadline, or
@@ -411,9 +411,9 @@ impl Client {
     /// Publishes a room from a `RoomUpload`, batches of frames and an `UploadEnd`, in this order.
     ///
     /// # Errors
-    /// [`Error::Refused`]; [`Error::Deadline`] if the connection takes no message for as long as the
-    /// deadline, or there is no response within it after the last one. The room may then still be
-    /// published.
+    /// [`Error::Refused`]; [`Error::Deadline`] if the connection takes no message for as long as
+    /// the deadline, or there is no response within it after the last one. The room may then still
+    /// be published.
     pub async fn upload_room(
         &self,
         messages: impl Stream<Item = pb::UploadRoomRequest> + Send + 'static,

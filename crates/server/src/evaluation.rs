@@ -252,7 +252,8 @@ fn list_pairs(
     let served = snapshot.room(&room)?;
     let loaded = served.load()?;
     let timeline = loaded.room.timeline();
-    // Each frame is at most twice in the test pairs, twice in the training pairs and once a candidate.
+    // Each frame is at most twice in the test pairs, twice in the training pairs and once a
+    // candidate.
     hold_for_answer(5 * ROW_BYTES * loaded.room.frame_count())?;
     let test = split.test_pairs(timeline, stride);
     let test = test.map_err(|error| Error::invalid("stride", error))?;

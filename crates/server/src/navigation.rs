@@ -118,8 +118,8 @@ fn navigate(
     let query = convert::query(request, &served.adapter, snapshot)?;
     let answer = served.navigator.answer(&query, limits, cancel)?;
 
-    // The answer states the step mode, variant and navigator in effect, including defaults. An index
-    // without an audit is the exact scan.
+    // The answer states the step mode, variant and navigator in effect, including defaults. An
+    // index without an audit is the exact scan.
     let room = served.navigator.room();
     let adapter = convert::adapter_revision(&served);
 

@@ -12,8 +12,8 @@ use seese3_core::features::Features;
 use seese3_core::geometry::Pose;
 use seese3_store::{KeypointsHeader, RoomKeypoints, StoredRoom};
 
-/// Target size of a message, bytes, well below the limits of servers and clients. A message holds at
-/// least one frame.
+/// Target size of a message, bytes, well below the limits of servers and clients. A message holds
+/// at least one frame.
 pub const MESSAGE_BYTES: usize = 1 << 20;
 
 /// Why a stored room cannot be sent.

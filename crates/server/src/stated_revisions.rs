@@ -51,8 +51,8 @@ impl StatedRevisions {
     /// The revisions of a request with a list of rooms.
     ///
     /// # Errors
-    /// [`Error::Invalid`] if a revision is stated of a room that the request does not name, or of an
-    /// adapter without its name.
+    /// [`Error::Invalid`] if a revision is stated of a room that the request does not name, or of
+    /// an adapter without its name.
     fn of_several(
         rooms: &[String],
         revisions: impl IntoIterator<Item = (String, u64)>,
@@ -123,8 +123,8 @@ pub trait StatesRevisions {
     fn stated_revisions(&self) -> Result<StatedRevisions, Error>;
 }
 
-/// Implements [`StatesRevisions`] for requests with the fields `room`, `room_revision`, `adapter` and
-/// `adapter_revision`.
+/// Implements [`StatesRevisions`] for requests with the fields `room`, `room_revision`, `adapter`
+/// and `adapter_revision`.
 macro_rules! of_one_room {
     ($($request:ty),*) => {$(
         impl StatesRevisions for $request {

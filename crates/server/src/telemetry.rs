@@ -69,8 +69,8 @@ macro_rules! request_span {
     }};
 }
 
-/// The span of a request. Its status is recorded later. Everybody can make health calls and calls of
-/// unknown paths, in any number, so they are logged at a lower level.
+/// The span of a request. Its status is recorded later. Everybody can make health calls and calls
+/// of unknown paths, in any number, so they are logged at a lower level.
 pub fn span<B>(request: &Request<B>) -> Span {
     // An unknown path may be long.
     let path = request.uri().path();

@@ -167,9 +167,9 @@ pub struct EvaluatedRoom<'a> {
     pub stride: Option<u32>,
 }
 
-/// The default adapter of an evaluation. It is never fitted to the room, and the test pairs are held
-/// out from its training. Of several: the room's default, then one that was trained in this room,
-/// then one with this stride, then the newest; adapters of experiments last.
+/// The default adapter of an evaluation. It is never fitted to the room, and the test pairs are
+/// held out from its training. Of several: the room's default, then one that was trained in this
+/// room, then one with this stride, then the newest; adapters of experiments last.
 ///
 /// # Errors
 /// [`NoDefault::NoneServes`] or [`NoDefault::AllLeak`].

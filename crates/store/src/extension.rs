@@ -58,7 +58,8 @@ impl Store {
     ///
     /// # Errors
     /// [`Error::Unknown`] if there is no such room, [`Error::CannotAdd`] if the frames are not
-    /// compatible with its own or it already has a part of them, otherwise as [`check_features`] and [`Store::load_room`].
+    /// compatible with its own or it already has a part of them, otherwise as [`check_features`]
+    /// and [`Store::load_room`].
     pub async fn extended_room(
         &self,
         addition: RoomContents<'_>,
@@ -74,7 +75,8 @@ impl Store {
     }
 
     /// Extends the newest revision of a room, as [`Store::extended_room`], and publishes the
-    /// result. If the room already has all of the frames, one after the other, nothing is published.
+    /// result. If the room already has all of the frames, one after the other, nothing is
+    /// published.
     ///
     /// # Errors
     /// As [`Store::extended_room`] and [`Store::publish_room`].

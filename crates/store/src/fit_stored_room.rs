@@ -214,8 +214,8 @@ fn check_base(base: &StoredAdapter, room: &str) -> Result<(), Error> {
     Ok(())
 }
 
-/// Whether an adapter's name is `ROOM.NAME` without a further dot. A name with one could belong to a
-/// room with a dotted name.
+/// Whether an adapter's name is `ROOM.NAME` without a further dot. A name with one could belong to
+/// a room with a dotted name.
 fn is_own_name(adapter: &str, room: &str) -> bool {
     let rest = adapter.strip_prefix(room);
     let rest = rest.and_then(|rest| rest.strip_prefix('.'));

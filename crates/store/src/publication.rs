@@ -1,7 +1,7 @@
 //! Conditions of publications: quotas and a time limit.
 //!
-//! When a quota is reached, a publication writes nothing. It still succeeds if the newest revision has
-//! the same content.
+//! When a quota is reached, a publication writes nothing. It still succeeds if the newest revision
+//! has the same content.
 //!
 //! A publication writes its objects first and its manifest last. Until then no manifest references
 //! the objects, and only their age protects them from garbage collection. Two limits together make

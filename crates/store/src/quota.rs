@@ -15,8 +15,8 @@ pub struct Quota {
     pub bytes: Option<u64>,
 }
 
-/// The quotas of a caller's publications. They apply to new revisions: publishing the content of the
-/// newest revision again succeeds at the limit.
+/// The quotas of a caller's publications. They apply to new revisions: publishing the content of
+/// the newest revision again succeeds at the limit.
 #[derive(Clone, Default)]
 pub struct Quotas {
     /// Of each room, with the adapters that are named `ROOM.NAME` and fitted to it.
@@ -128,8 +128,9 @@ impl Store {
         Ok(used)
     }
 
-    /// Whether an adapter, or what is left of a removed one, belongs to one of the rooms that `counts`
-    /// selects. A damaged one belongs to none: otherwise a room could be charged for another's.
+    /// Whether an adapter, or what is left of a removed one, belongs to one of the rooms that
+    /// `counts` selects. A damaged one belongs to none: otherwise a room could be charged for
+    /// another's.
     async fn belongs_to(
         &self,
         adapter: &str,

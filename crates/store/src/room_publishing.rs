@@ -75,8 +75,8 @@ fn room_body(room: &Room, objects: &RoomObjects, revision: u64) -> RoomBody {
     }
 }
 
-/// The newest revision, if it equals `body` except for the revision number, the date and the extent,
-/// which follows from the frames.
+/// The newest revision, if it equals `body` except for the revision number, the date and the
+/// extent, which follows from the frames.
 fn unchanged(folder: &Path, body: &RoomBody, newest: Option<RoomBody>) -> Option<Published> {
     let newest = newest?;
     let same = RoomBody {

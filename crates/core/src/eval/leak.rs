@@ -56,8 +56,8 @@ pub fn has_seen(record: &TrainingRecord, room: &RoomId) -> bool {
 
 impl Report {
     /// This report with its leaking rows marked. With a `leak`, the rows of all navigators that use
-    /// the adapter leak; the baselines do not use it. If the adapter was calibrated in the room, the
-    /// rows of calibrated navigators leak.
+    /// the adapter leak; the baselines do not use it. If the adapter was calibrated in the room,
+    /// the rows of calibrated navigators leak.
     #[must_use]
     pub fn marked(mut self, leak: Option<Leak>, is_calibrated_here: bool) -> Self {
         for row in &mut self.rows {

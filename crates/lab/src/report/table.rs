@@ -169,8 +169,8 @@ const TERMINAL_WIDTH: usize = 100;
 const GAP: usize = 2;
 
 /// Every column is as wide as its widest cell. The first is left-aligned, the others are
-/// right-aligned. A table wider than 100 characters is folded: its columns follow in blocks, each of
-/// which begins with the first column. There is no line break after the last line.
+/// right-aligned. A table wider than 100 characters is folded: its columns follow in blocks, each
+/// of which begins with the first column. There is no line break after the last line.
 impl fmt::Display for Table {
     fn fmt(&self, to: &mut fmt::Formatter<'_>) -> fmt::Result {
         let widths = self.widths();

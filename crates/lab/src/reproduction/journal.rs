@@ -58,8 +58,8 @@ pub(super) struct Kept<'a> {
 }
 
 impl Kept<'_> {
-    /// The result of a step: the kept one, else that of `run`, which is then kept. Adds the claims of
-    /// the step to `claims`.
+    /// The result of a step: the kept one, else that of `run`, which is then kept. Adds the claims
+    /// of the step to `claims`.
     pub fn step<R: Serialize>(
         &self,
         name: &'static str,

@@ -542,8 +542,8 @@ fn a_picture_that_freezes_before_a_stop_is_not_trusted() {
     }
 }
 
-/// Oracle: the contract. Wheels drive 0.3 m beside a frozen picture with noise, and pause for a minute: the
-/// noise is not taken for motion, so no pose is TRACKING.
+/// Oracle: the contract. Wheels drive 0.3 m beside a frozen picture with noise, and pause for a
+/// minute: the noise is not taken for motion, so no pose is TRACKING.
 #[test]
 fn noise_of_a_frozen_picture_is_not_motion() {
     let filter = filter();

@@ -162,8 +162,8 @@ impl Handlers {
             .await
     }
 
-    /// Deletes a room or an adapter. `right` checks the caller's right when the change has its turn,
-    /// so that no other change comes between.
+    /// Deletes a room or an adapter. `right` checks the caller's right when the change has its
+    /// turn, so that no other change comes between.
     async fn delete<A: Message + Default + 'static>(
         &self,
         identity: Identity,

@@ -276,8 +276,8 @@ mod tests {
         assert_eq!(connections.closed(), [4, 5, 6]);
     }
 
-    /// Oracle: the contract: a gateway's connection is of its first caller while that is valid; then
-    /// of the next one to call.
+    /// Oracle: the contract: a gateway's connection is of its first caller while that is valid;
+    /// then of the next one to call.
     #[test]
     fn a_gateway_has_one_owner() {
         let connections = Connections::of(8, 2);

@@ -59,8 +59,8 @@ pub fn pose(pose: pb::Pose, room: &str) -> Result<Pose, Error> {
         orientation,
     } = pose;
 
-    // Empty names mean the room's world and the camera, as does the default name of the map frame in
-    // Track. The server knows no other frames.
+    // Empty names mean the room's world and the camera, as does the default name of the map frame
+    // in Track. The server knows no other frames.
     let world = world_frame(room);
     if ![String::new(), MAP.to_owned(), world.clone()].contains(&parent_frame) {
         return Err(Error::invalid(

@@ -441,8 +441,8 @@ impl Snapshot {
         Ok(across_rooms(&served)?)
     }
 
-    /// The default adapter of a task without a room: the only one that is not fitted to a room, else
-    /// the only one.
+    /// The default adapter of a task without a room: the only one that is not fitted to a room,
+    /// else the only one.
     ///
     /// # Errors
     /// [`Error::Invalid`] on `adapter` if there are several.

@@ -108,8 +108,8 @@ impl PinnedRevisions {
 }
 
 impl Snapshot {
-    /// This snapshot with the revisions that a request states. Reads the store: call only on threads
-    /// that may block.
+    /// This snapshot with the revisions that a request states. Reads the store: call only on
+    /// threads that may block.
     ///
     /// # Errors
     /// [`Error::NotFound`] if this snapshot has no such room or adapter, or the store no such

@@ -94,8 +94,8 @@ impl ServedRoom {
     /// block.
     ///
     /// # Errors
-    /// [`Error::Precondition`] if the room cannot be loaded; the log says why. [`Error::Full`] if too
-    /// many requests wait for the disk.
+    /// [`Error::Precondition`] if the room cannot be loaded; the log says why. [`Error::Full`] if
+    /// too many requests wait for the disk.
     pub fn load(&self) -> Result<Arc<LoadedRoom>, Error> {
         // Damaged files are not read again; unreadable ones are retried.
         let refused = self.refusal().filter(|refusal| !refusal.may_pass);

@@ -233,8 +233,8 @@ async fn a_fitted_room_is_relocalized_by_its_own_adapter() {
     assert!(found.rooms.iter().all(|room| room.fitted.is_none()));
 }
 
-/// Oracle: the rules of docs/defaults.md. The server has rooms hall and attic, an adapter of both and
-/// one that is fitted to the hall.
+/// Oracle: the rules of docs/defaults.md. The server has rooms hall and attic, an adapter of both
+/// and one that is fitted to the hall.
 #[tokio::test]
 async fn a_fitted_adapter_does_not_count_where_no_room_is_named() {
     let server = server().await;
@@ -278,8 +278,8 @@ async fn a_fitted_adapter_does_not_count_where_no_room_is_named() {
     assert_eq!(used.unwrap().name, "hall.fitted");
 }
 
-/// Oracle: the training records. Both adapters were trained on every frame of the hall, a third one on
-/// the first four fifths.
+/// Oracle: the training records. Both adapters were trained on every frame of the hall, a third one
+/// on the first four fifths.
 #[tokio::test]
 async fn an_evaluation_takes_an_adapter_that_has_not_seen_the_test_frames() {
     let server = server().await;

@@ -1,5 +1,5 @@
-//! Requests that state revisions: a published evaluation can be repeated after its room and its adapter
-//! have changed.
+//! Requests that state revisions: a published evaluation can be repeated after its room and its
+//! adapter have changed.
 
 use seese3_client::proto::v1 as pb;
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
