@@ -100,6 +100,41 @@ enum CountedName {
 
 type Loaded = (StoredRoom, Features);
 
+/// Prints the conditions of M2, and which R² are undefined.
+fn say_conditions(scores: &[ProbeScores]) {
+    // M2 depends on the gap and on how duplicates were treated, so these are printed with it.
+    for score in scores {
+        let Some(DimensionScore {
+            dimension,
+            protocol,
+        }) = &score.m2
+        else {
+            continue;
+        };
+
+        say(format_args!(
+            "M2 of {}: {} rows used, {} dropped as duplicates, gap {}",
+            score.room, dimension.used, dimension.dropped, protocol.gap
+        ));
+    }
+
+    // R² of a component that is constant over the test pairs would divide by a variance of
+    // zero.
+    let still = scores
+        .iter()
+        .flat_map(|score| score.m3.iter().chain(&score.m4))
+        .flat_map(|at| &at.runs);
+
+    if still
+        .map(MotionScores::still_components)
+        .any(|count| count > 0)
+    {
+        say(
+            "some components of the motion never vary; they have no R² and are left out of the means",
+        );
+    }
+}
+
 impl Probe {
     pub async fn run(self) -> anyhow::Result<()> {
         let store = self.common.open()?;
@@ -154,37 +189,7 @@ impl Probe {
             .iter()
             .for_each(|why| say(format_args!("skipped: {why}")));
 
-        // M2 depends on the gap and on how duplicates were treated, so these are printed with it.
-        for score in &scores {
-            let Some(DimensionScore {
-                dimension,
-                protocol,
-            }) = &score.m2
-            else {
-                continue;
-            };
-
-            say(format_args!(
-                "M2 of {}: {} rows used, {} dropped as duplicates, gap {}",
-                score.room, dimension.used, dimension.dropped, protocol.gap
-            ));
-        }
-
-        // R² of a component that is constant over the test pairs would divide by a variance of
-        // zero.
-        let still = scores
-            .iter()
-            .flat_map(|score| score.m3.iter().chain(&score.m4))
-            .flat_map(|at| &at.runs);
-
-        if still
-            .map(MotionScores::still_components)
-            .any(|count| count > 0)
-        {
-            say(
-                "some components of the motion never vary; they have no R² and are left out of the means",
-            );
-        }
+        say_conditions(&scores);
 
         self.common.json.write(&ProbeJson {
             rooms: ProbedRooms::of(&scores),

@@ -5,7 +5,7 @@ use clap::Args;
 use seese3_core::eval::has_seen;
 use seese3_core::features::Features;
 use seese3_core::splits::Split;
-use seese3_lab::experiments::motion::{FrameKeypoints, evaluate};
+use seese3_lab::experiments::motion::{FrameKeypoints, MotionEvaluation, evaluate};
 use seese3_lab::report::{MotionEvaluationJson, motion_table};
 
 use super::super::output::{JsonOutput, say};
@@ -102,16 +102,7 @@ impl Motion {
         if let Some((adapter, _)) = &adapter {
             say_adapter(adapter, in_room == Some(true));
         }
-        let title = format!(
-            "{}: {} motions over {} frames",
-            self.room, found.n, self.stride
-        );
-        let (table, notes) = motion_table(&found);
-        self.files.say(&table, &title)?;
-        if !notes.is_empty() {
-            say(notes);
-        }
-
+        self.say_table(&found)?;
         self.json.write(&MotionEvaluationJson {
             found: &found,
             room: &self.room,
@@ -119,6 +110,19 @@ impl Motion {
             stride: self.stride,
             in_room,
         })
+    }
+}
+
+impl Motion {
+    fn say_table(&self, found: &MotionEvaluation) -> anyhow::Result<()> {
+        let (room, stride) = (&self.room, self.stride);
+        let title = format!("{room}: {} motions over {stride} frames", found.n);
+        let (table, notes) = motion_table(found);
+        self.files.say(&table, &title)?;
+        if !notes.is_empty() {
+            say(notes);
+        }
+        Ok(())
     }
 }
 

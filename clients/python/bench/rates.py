@@ -116,8 +116,8 @@ def cases(client: seese3.Client, address: str, rows: np.ndarray) -> Cases:
     def question(source: geometry_pb2.View) -> navigation_pb2.NavigateRequest:
         v, w = MOTION[:3], MOTION[3:]
         linear, angular = geometry_pb2.Vector3(x=v[0], y=v[1], z=v[2]), geometry_pb2.Vector3(x=w[0], y=w[1], z=w[2])
-        motion = navigation_pb2.Displacement(twist=geometry_pb2.Twist(linear=linear, angular=angular))
-        return navigation_pb2.NavigateRequest(room=ROOM, source=source, displacement=motion, steps=4)
+        motion = navigation_pb2.RequestedMotion(twist=geometry_pb2.Twist(linear=linear, angular=angular))
+        return navigation_pb2.NavigateRequest(room=ROOM, source=source, motion=motion, steps=4)
 
     def numbered(row: int) -> geometry_pb2.View:
         return geometry_pb2.View(frame_id=row % FRAMES)

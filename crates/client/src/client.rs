@@ -121,6 +121,37 @@ impl From<Status> for Error {
     }
 }
 
+/// The endpoint of an address, HOST:PORT or a URL.
+///
+/// # Errors
+/// [`Error::Address`].
+fn endpoint_of(address: &str, has_tls: bool) -> Result<Endpoint, Error> {
+    if has_tls && address.starts_with("http://") {
+        return Err(Error::Address {
+            address: address.to_owned(),
+            problem: "http:// is without TLS, but certificates are given".to_owned(),
+        });
+    }
+    let url = match has_tls {
+        _ if address.contains("://") => address.to_owned(),
+        true => format!("https://{address}"),
+        false => format!("http://{address}"),
+    };
+    let endpoint = Endpoint::from_shared(url).map_err(|error| Error::Address {
+        address: address.to_owned(),
+        problem: error.to_string(),
+    })?;
+
+    // A URL has the port of its scheme; an address without one was typed incompletely.
+    if !address.contains("://") && endpoint.uri().port().is_none() {
+        return Err(Error::Address {
+            address: address.to_owned(),
+            problem: "it has no port; the servers' default is 50051".to_owned(),
+        });
+    }
+    Ok(endpoint)
+}
+
 /// A connection to a server. Clones are cheap and share the connection.
 #[derive(Debug, Clone)]
 pub struct Client {
@@ -200,30 +231,7 @@ impl Client {
             }
         };
 
-        if tls.is_some() && address.starts_with("http://") {
-            return Err(Error::Address {
-                address: address.to_owned(),
-                problem: "http:// is without TLS, but certificates are given".to_owned(),
-            });
-        }
-        let url = match &tls {
-            _ if address.contains("://") => address.to_owned(),
-            Some(_) => format!("https://{address}"),
-            None => format!("http://{address}"),
-        };
-        let endpoint = Endpoint::from_shared(url).map_err(|error| Error::Address {
-            address: address.to_owned(),
-            problem: error.to_string(),
-        })?;
-
-        // A URL has the port of its scheme; an address without one was typed incompletely.
-        if !address.contains("://") && endpoint.uri().port().is_none() {
-            return Err(Error::Address {
-                address: address.to_owned(),
-                problem: "it has no port; the servers' default is 50051".to_owned(),
-            });
-        }
-
+        let endpoint = endpoint_of(address, tls.is_some())?;
         let within = deadline.min(LONGEST_CONNECTING);
         let mut endpoint = endpoint
             .connect_timeout(within)

@@ -178,26 +178,8 @@ pub(super) fn extended(
     let frames = joined_frames(base.room.frames(), addition.frames())
         .map_err(|problem| refused(problem.into()))?;
 
-    let known = base.room.provenance();
-    let added = addition.provenance();
-    let problem = match (&added.camera, &known.camera) {
-        (Some(added), Some(known)) => known.difference(added),
-        _ => None,
-    };
-    if let Some(problem) = problem {
-        return Err(refused(
-            format!("their camera {problem}; make a room of their own").into(),
-        ));
-    }
-
-    let provenance = Provenance {
-        images_root: String::new(),
-        worst_rotation_deviation: known
-            .worst_rotation_deviation
-            .max(added.worst_rotation_deviation),
-        ..known.clone()
-    };
-
+    let provenance = joined_provenance(base.room.provenance(), addition.provenance())
+        .map_err(|problem| refused(problem.into()))?;
     let room = Room::new(base.room.id().clone(), frames, provenance)
         .map_err(|error| refused(error.into()))?;
     let known = base.room.frame_count();
@@ -215,6 +197,25 @@ pub(super) fn extended(
         keypoints,
         base: base.revision,
         is_there: false,
+    })
+}
+
+/// The origin of the room with the added frames.
+fn joined_provenance(known: &Provenance, added: &Provenance) -> Result<Provenance, String> {
+    let problem = match (&added.camera, &known.camera) {
+        (Some(added), Some(known)) => known.difference(added),
+        _ => None,
+    };
+    if let Some(problem) = problem {
+        return Err(format!("their camera {problem}; make a room of their own"));
+    }
+
+    Ok(Provenance {
+        images_root: String::new(),
+        worst_rotation_deviation: known
+            .worst_rotation_deviation
+            .max(added.worst_rotation_deviation),
+        ..known.clone()
     })
 }
 

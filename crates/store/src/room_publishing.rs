@@ -162,6 +162,9 @@ impl Store {
         contents: RoomContents<'_>,
         policy: UploadPolicy,
     ) -> Result<Published, Error> {
+        check_features(contents.room, contents.features)?;
+        // A refused upload writes nothing.
+        self.check_upload(contents.room, policy).await?;
         self.publish_over(contents, PublishPolicy::Upload(policy))
             .await
     }
@@ -290,10 +293,6 @@ impl Store {
         check_features(room, features)?;
         check_keypoints(room, keypoints)?;
         let folder = folder_of(Kind::Room, room.id().as_str());
-        // A refused upload writes nothing.
-        if let PublishPolicy::Upload(policy) = over {
-            self.check_upload(room, policy).await?;
-        }
         let publication = Publication::begin(self, Some(room.id().as_str())).await?;
 
         // A repeated import, for instance without images, must not lose stored data: missing

@@ -89,7 +89,7 @@ impl TrackedRoom {
     /// A stored frame as a wire message.
     pub fn retrieved(&self, neighbor: seese3_core::index::Neighbor) -> pb::RetrievedFrame {
         let retrieved = RetrievedFrame {
-            neighbor: neighbor,
+            neighbor,
             pose: self.room.poses()[neighbor.frame.row()],
         };
         convert::retrieved_to_wire(&retrieved, &self.room)
