@@ -80,6 +80,9 @@ impl Push {
         };
 
         let Some(revision) = revision else {
+            if !self.dry_run {
+                bail!("the server does not say what it published; see `seese3 catalog`");
+            }
             say(format_args!("{target} would be accepted"));
             return self
                 .common
