@@ -195,10 +195,15 @@ async fn fit_on_server(
     Ok(fitted)
 }
 
-/// Says what may have happened to an upload without a response.
+/// Says what may have happened to an upload without a response, and which option helps a refused one.
 fn unanswered(error: seese3_client::Error) -> anyhow::Error {
     let is_late = matches!(error, seese3_client::Error::Deadline);
+    let exists = error.reason().as_deref() == Some("ALREADY_EXISTS");
     let error = anyhow::Error::from(error);
+    if exists {
+        return error
+            .context("give --replace for a new revision, --extend to add frames, or --as NAME");
+    }
     if !is_late {
         return error;
     }

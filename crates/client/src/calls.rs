@@ -76,6 +76,9 @@ impl Pages {
     }
 }
 
+/// The largest weights of a downloaded adapter, bytes.
+const LARGEST_WEIGHTS: usize = 1 << 30;
+
 impl Client {
     /// Navigates from a view by a motion.
     ///
@@ -333,7 +336,8 @@ impl Client {
     ///
     /// # Errors
     /// [`Error::Refused`], [`Error::Deadline`] if no message comes for as long as the deadline, or
-    /// [`Error::NoReport`] if the stream has no manifest.
+    /// [`Error::NoReport`] if the stream has no manifest, [`Error::Download`] if its messages are not
+    /// in order, or its weights are larger than 1 GiB.
     pub async fn download_adapter(
         &self,
         request: pb::DownloadAdapterRequest,
@@ -347,9 +351,14 @@ impl Client {
         let (mut adapter, mut weights) = (None, Vec::new());
         while let Some(received) = self.in_time(messages.message()).await? {
             match received.message {
-                Some(Message::Adapter(first)) => adapter = Some(first),
-                Some(Message::Weights(part)) => weights.extend(part),
-                None => {}
+                Some(Message::Adapter(first)) if adapter.is_none() => adapter = Some(first),
+                Some(Message::Weights(part)) if adapter.is_some() && !part.is_empty() => {
+                    weights.extend(part);
+                }
+                _ => return Err(Error::Download("its messages are not in order")),
+            }
+            if weights.len() > LARGEST_WEIGHTS {
+                return Err(Error::Download("its weights are larger than 1 GiB"));
             }
         }
         Ok((adapter.ok_or(Error::NoReport)?, weights))

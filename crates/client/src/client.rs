@@ -48,6 +48,8 @@ pub enum Error {
     NoReport,
     #[error("the server's list has no end")]
     EndlessList,
+    #[error("the server's download cannot be used: {0}")]
+    Download(&'static str),
 }
 
 impl Error {

@@ -95,7 +95,8 @@ pub fn layers_table(scores: &[LayerScores]) -> Table {
 
     let mut table = Table::new("features | columns | M1 | TwoNN | MLE | M3 R² | M4 R² | constant");
     for layer in &layers {
-        let star = |metric: &Metric| match metric.is_best(layer, &layers) {
+        let is_one_of_several = layers.len() > 1;
+        let star = |metric: &Metric| match is_one_of_several && metric.is_best(layer, &layers) {
             true => "*",
             false => " ",
         };
@@ -219,6 +220,13 @@ mod tests {
         assert!(lines[0].contains("-1.000 ± 0.100 "), "{lines:?}");
         // The ridge probe has no seeds, and is better in both rooms by the same.
         assert!(lines[0].contains("-1.000*"), "{lines:?}");
+    }
+
+    /// Oracle: the definition: the best is the best of several.
+    #[test]
+    fn the_only_layer_has_no_star() {
+        let lines = lines(&[score("a", "r", 0.2, 6.0, 0.5)]);
+        assert!(!lines[0].contains('*'), "{lines:?}");
     }
 
     /// Oracle: by hand: −4 is below the −3 of the constant answer.
