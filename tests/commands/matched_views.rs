@@ -194,7 +194,7 @@ fn tracks_without_an_adapter(here: &Place, to: &str) {
     assert!(error < 0.03, "{error}");
 
     assert!(fs::metadata(here.file("token")).unwrap().len() < 600);
-    let resumed = "--images stream --from 3 --resume token";
+    let resumed = "--images stream --first 3 --resume token";
     here.prints(
         &format!("track {to} {resumed} --json here.jsonl"),
         &["2 of them TRACKING"],
