@@ -21,8 +21,18 @@ def anchor(name):
     return name.lower().replace(".", "")
 
 
-def type_of(field):
+def map_entries(message):
+    """The (key, value) fields of each map of a message, by the name of the map's entry."""
+    nested = message.get("nestedType", [])
+    return {entry["name"]: entry["field"] for entry in nested if entry.get("options", {}).get("mapEntry")}
+
+
+def type_of(field, maps):
     """The type of a field, with a link where it has its own section."""
+    entry = maps.get(field.get("typeName", "").rsplit(".", 1)[-1])
+    if entry:
+        key, value = (type_of({**side, "proto3Optional": False, "label": ""}, {}) for side in entry)
+        return f"map of {key} to {value}"
     plain = field["type"].removeprefix("TYPE_").lower()
     full = field.get("typeName", "").removeprefix(".")
     name = full.removeprefix("seese3.v1.")
@@ -49,6 +59,7 @@ def message_lines(message, path, said):
     fields = message.get("field", [])
     if not fields:
         return
+    maps = map_entries(message)
     oneofs = [oneof["name"] for oneof in message.get("oneofDecl", [])]
     for index, oneof in enumerate(oneofs):
         words = one_line(said.get((*path, 8, index), ""))
@@ -61,7 +72,7 @@ def message_lines(message, path, said):
         meaning = one_line(said.get((*path, 2, index), ""))
         if "oneofIndex" in field and not field.get("proto3Optional"):
             meaning = f"One of `{oneofs[field['oneofIndex']]}`. {meaning}"
-        yield f"| `{field['name']}` = {field['number']} | {type_of(field)} | {meaning} |"
+        yield f"| `{field['name']}` = {field['number']} | {type_of(field, maps)} | {meaning} |"
     yield ""
 
 

@@ -7,6 +7,8 @@ use clap::Args;
 
 use super::output::{check_writable, say, write_file};
 use seese3_lab::report::{Table, dot_plot};
+#[cfg(feature = "plots")]
+use seese3_lab::report::{plot_pdf, plot_png};
 
 #[derive(Debug, Args)]
 pub struct TableFiles {
@@ -14,8 +16,8 @@ pub struct TableFiles {
     /// Markdown
     #[arg(long, value_name = "FILE", value_parser = table_file)]
     table: Option<PathBuf>,
-    /// Also draw the table to this SVG file: a panel for each column of numbers
-    #[arg(long, value_name = "FILE.svg", value_parser = plot_file)]
+    /// Also draw the table to this file, .svg, .pdf or .png: a panel for each column of numbers
+    #[arg(long, value_name = "FILE", value_parser = plot_file)]
     plot: Option<PathBuf>,
 }
 
@@ -34,8 +36,7 @@ impl TableFiles {
             say(format_args!("wrote {}", file.display()));
         }
         if let Some(file) = &self.plot {
-            write_file(file, &dot_plot(table, title)?)?;
-            say(format_args!("wrote {}", file.display()));
+            write_plot(file, dot_plot(table, title)?)?;
         }
         Ok(())
     }
@@ -50,9 +51,34 @@ fn table_text(file: &Path, table: &Table) -> String {
     }
 }
 
-/// Accepts a file name that ends with .svg.
+/// Writes an SVG plot in the format of the file's extension, and says so.
+pub fn write_plot(file: &Path, svg: Vec<u8>) -> anyhow::Result<()> {
+    write_file(file, &plot_bytes(file, svg)?)?;
+    say(format_args!("wrote {}", file.display()));
+    Ok(())
+}
+
+#[cfg(feature = "plots")]
+fn plot_bytes(file: &Path, svg: Vec<u8>) -> anyhow::Result<Vec<u8>> {
+    Ok(match file.extension().and_then(OsStr::to_str) {
+        Some("pdf") => plot_pdf(&svg)?,
+        Some("png") => plot_png(&svg)?,
+        _ => svg,
+    })
+}
+
+#[cfg(not(feature = "plots"))]
+fn plot_bytes(_: &Path, svg: Vec<u8>) -> anyhow::Result<Vec<u8>> {
+    Ok(svg)
+}
+
+/// Accepts a file name that ends with .svg, .pdf or .png.
 pub fn plot_file(given: &str) -> Result<PathBuf, String> {
-    named(given, &["svg"])
+    let file = named(given, &["svg", "pdf", "png"])?;
+    if cfg!(not(feature = "plots")) && file.extension() != Some(OsStr::new("svg")) {
+        return Err("this build draws .svg only; .pdf and .png need the feature plots".into());
+    }
+    Ok(file)
 }
 
 /// Accepts a file name that ends with .csv, .tex or .md.

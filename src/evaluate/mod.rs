@@ -25,7 +25,7 @@ use clap::{Args, Subcommand};
 use super::named::one_of;
 use super::output::{JsonOutput, STANDARD_OUTPUT, check_writable, say, write_file};
 use super::progress::bar;
-use crate::table_files::{plot_file, table_file};
+use crate::table_files::{plot_file, table_file, write_plot};
 use seese3_core::adapter::TrainingRecord;
 use seese3_core::cancel::Cancellation;
 use seese3_core::eval::{
@@ -147,8 +147,9 @@ struct Navigation {
     /// Seed of the random navigator
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Plot Hit@ε against ε up to 1, one curve per navigator, to this SVG file
-    #[arg(long, value_name = "FILE.svg", value_parser = plot_file)]
+    /// Plot Hit@ε against ε up to 1, one curve per navigator, to this file:
+    /// .svg, .pdf or .png
+    #[arg(long, value_name = "FILE", value_parser = plot_file)]
     plot: Option<PathBuf>,
     /// Also write the table to this file: .csv for programs, .tex for LaTeX with booktabs, .md for
     /// Markdown
@@ -308,8 +309,7 @@ impl Navigation {
                 let is_plain = |name: &str| !name.contains('+') && !name.contains("-in-sample");
                 drawn.series.retain(|series| is_plain(&series.name));
             }
-            write_file(file, &drawn.svg()?)?;
-            say(format_args!("wrote {}", file.display()));
+            write_plot(file, drawn.svg()?)?;
         }
         Ok(())
     }

@@ -98,6 +98,17 @@ fn tables_and_plots_are_what_their_names_say() {
     assert!(plot.starts_with("<svg") && plot.matches("<circle").count() > 50 * 5);
     assert!(plot.contains("identity") && !plot.contains("in-sample"));
 
+    here.succeeds(&format!("{evaluate} --plot p.pdf"));
+    let bytes = std::fs::read(here.file("p.pdf")).unwrap();
+    assert!(bytes.starts_with(b"%PDF-1."));
+    here.succeeds("theory --poses 400 --samples 16 --plot p.png");
+    assert_eq!(
+        image::guess_format(&std::fs::read(here.file("p.png")).unwrap()).unwrap(),
+        image::ImageFormat::Png
+    );
+    let other = here.run("theory --plot p.gif");
+    assert!(said(&other).contains(".svg or .pdf or .png"));
+
     let other = here.run(&format!("{evaluate} --table table.xlsx"));
     assert_eq!(other.status.code(), Some(2));
     assert!(said(&other).contains(".csv or .tex or .md"));

@@ -17,6 +17,8 @@ mod localization;
 mod odometry;
 mod path_errors;
 mod planning;
+#[cfg(feature = "plots")]
+mod plot_format;
 mod probe;
 mod robustness;
 mod table;
@@ -55,6 +57,8 @@ pub use path_errors::{
     APE_FORMULA, PathErrorsJson, RPE_FORMULA, path_errors_json, path_errors_table,
 };
 pub use planning::{PlanningJson, planning_json, planning_table};
+#[cfg(feature = "plots")]
+pub use plot_format::{plot_pdf, plot_png};
 pub use probe::{ProbeJson, ProbedRooms, probe_table};
 pub use robustness::{RobustnessJson, robustness_json, robustness_table};
 pub use table::{Column, Table, fixed};
