@@ -21,7 +21,7 @@ use clap::{ArgMatches, Args, Command, CommandFactory, FromArgMatches, Subcommand
 
 use super::Cli;
 use super::examples::with_examples;
-use super::help::with_headings;
+use super::help::{with_comma_lists, with_headings};
 use super::output::say;
 use super::serve::Serve;
 
@@ -122,7 +122,7 @@ impl std::fmt::Display for Setting {
 /// If the file cannot be read or has an unknown key. Clap prints its own errors and exits.
 pub fn parse() -> anyhow::Result<Cli> {
     let arguments: Vec<OsString> = std::env::args_os().collect();
-    let mut command = with_headings(with_examples(Cli::command()));
+    let mut command = with_headings(with_examples(with_comma_lists(Cli::command())));
 
     let reads_file = arguments
         .get(1)

@@ -84,7 +84,8 @@ fn say_fitted(fitted: &Fitted, data: &RoomData<'_>) {
     ));
 
     say(
-        "expected error of a view, by the distance of its feature from the nearest mapped feature:",
+        "expected error of a view, by the distance of its feature from the nearest mapped feature (in standard \
+         deviations of a feature column):",
     );
     for expected in fitted.rules.expected_errors() {
         say(format_args!(

@@ -1,6 +1,6 @@
 //! The program's own help: its commands under four headings.
 
-use clap::Command;
+use clap::{Command, Id};
 
 /// Width of the list of commands, columns.
 const COLUMNS: usize = 80;
@@ -57,6 +57,32 @@ pub fn with_headings(command: Command) -> Command {
         "{{about-with-newline}}\n{{usage-heading}} {{usage}}\n\n{commands}\
          Options:\n{{options}}{{after-help}}"
     ))
+}
+
+/// The command with every default list as it is given on the command line, with commas.
+pub fn with_comma_lists(mut command: Command) -> Command {
+    let lists: Vec<(Id, String)> = command
+        .get_arguments()
+        .filter(|argument| argument.get_value_delimiter() == Some(','))
+        .filter(|argument| argument.get_default_values().len() > 1)
+        .map(|argument| {
+            let values = argument.get_default_values().iter();
+            let values: Vec<_> = values.map(|value| value.to_string_lossy()).collect();
+            (argument.get_id().clone(), values.join(","))
+        })
+        .collect();
+    for (id, list) in lists {
+        command = command.mut_arg(id, |argument| argument.default_value(list));
+    }
+
+    let names: Vec<String> = command
+        .get_subcommands()
+        .map(|subcommand| subcommand.get_name().to_owned())
+        .collect();
+    for name in names {
+        command = command.mut_subcommand(name, with_comma_lists);
+    }
+    command
 }
 
 fn commands_text(command: &Command) -> String {

@@ -9,6 +9,7 @@ use clap_complete::Shell;
 
 use super::Cli;
 use super::examples::with_examples;
+use super::help::with_comma_lists;
 use super::output::say;
 
 #[derive(Debug, Args)]
@@ -38,7 +39,7 @@ impl Man {
         let failed = || format!("{} cannot be written", self.out.display());
         std::fs::create_dir_all(&self.out).with_context(failed)?;
 
-        let command = with_examples(Cli::command()).disable_help_subcommand(true);
+        let command = with_examples(with_comma_lists(Cli::command())).disable_help_subcommand(true);
         clap_mangen::generate_to(command, &self.out).with_context(failed)?;
 
         let count = std::fs::read_dir(&self.out).with_context(failed)?.count();

@@ -18,7 +18,7 @@ use seese3_lab::experiments::probe::{
     DimensionProtocol, DimensionScore, ProbeProtocol, ProbeScores, probe, probe_adapters,
 };
 use seese3_lab::probes::{Counted, Duplicates, Limit, MutualKnn};
-use seese3_lab::report::{ProbeJson, ProbedRooms, probe_table};
+use seese3_lab::report::{ProbeJson, ProbedRooms, probe_plot, probe_table};
 use seese3_store::StoredRoom;
 
 // M1 to M4 are the paper's, so M4 trains as the paper does, also in `sweep layers`.
@@ -181,8 +181,9 @@ impl Probe {
             self.seeds
         ));
 
-        self.files.say(
+        self.files.say_and_draw(
             &probe_table(&scores),
+            &probe_plot(&scores),
             &format!("features {}", rooms[0].1.source().name),
         )?;
         skipped

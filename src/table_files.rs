@@ -16,7 +16,7 @@ pub struct TableFiles {
     /// Markdown
     #[arg(long, value_name = "FILE", value_parser = table_file)]
     table: Option<PathBuf>,
-    /// Also draw the table to this file, .svg, .pdf or .png: a panel for each column of numbers
+    /// Also draw the numbers to this file, .svg, .pdf or .png: a panel for each column
     #[arg(long, value_name = "FILE", value_parser = plot_file)]
     plot: Option<PathBuf>,
 }
@@ -30,13 +30,18 @@ impl TableFiles {
 
     /// Prints the table, and writes the files that were asked for. `title` is that of the plot.
     pub fn say(&self, table: &Table, title: &str) -> anyhow::Result<()> {
+        self.say_and_draw(table, table, title)
+    }
+
+    /// The same, but `drawn` is drawn instead of the table.
+    pub fn say_and_draw(&self, table: &Table, drawn: &Table, title: &str) -> anyhow::Result<()> {
         say(table);
         if let Some(file) = &self.table {
             write_file(file, table_text(file, table).as_bytes())?;
             say(format_args!("wrote {}", file.display()));
         }
         if let Some(file) = &self.plot {
-            write_plot(file, dot_plot(table, title)?)?;
+            write_plot(file, dot_plot(drawn, title)?)?;
         }
         Ok(())
     }

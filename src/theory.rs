@@ -6,7 +6,7 @@ use clap::Args;
 use super::output::JsonOutput;
 use super::progress::bar;
 use crate::table_files::TableFiles;
-use seese3_lab::report::{theory_json, theory_table};
+use seese3_lab::report::{theory_json, theory_plot, theory_table};
 use seese3_lab::theory::{Effort, checks};
 
 #[derive(Debug, Args)]
@@ -45,8 +45,11 @@ impl Theory {
         })?;
 
         progress.finish_and_clear();
-        self.files
-            .say(&theory_table(&found), "theory: measured values and bounds")?;
+        self.files.say_and_draw(
+            &theory_table(&found),
+            &theory_plot(&found),
+            "theory: measured values within their bounds",
+        )?;
         self.json.write(&theory_json(&found))?;
 
         // The table and the file show every check; the exit status reports whether all bounds hold.

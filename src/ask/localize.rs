@@ -5,7 +5,7 @@ use clap::Args;
 
 use super::{
     FeatureRow, Server, ViewCamera, error_text, estimate_text, fitted_text, frame_text,
-    matches_text, revision, wire_json,
+    matches_text, revision, rooms_text, wire_json,
 };
 use crate::camera::CAMERA_FORM;
 use crate::output::{JsonOutput, say};
@@ -80,9 +80,9 @@ impl Localize {
             None => "no adapter".to_owned(),
         };
         say(format_args!(
-            "room {}, {novelty}; {adapter}, {} rooms searched",
+            "room {}, {novelty}; {adapter}, {} searched",
             revision(answer.room.as_ref()),
-            answer.room_count
+            rooms_text(answer.room_count)
         ));
 
         // Only a view that is a frame of the room has a recorded pose, and hence an error.

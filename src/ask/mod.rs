@@ -186,7 +186,8 @@ fn matches_text(matches: &pb::KeypointMatches) -> String {
 
 fn fitted_text(fitted: &pb::FittedEstimate) -> String {
     format!(
-        "from frame {}, distance {:.3}: translation {} × {:.1}, rotation {} × {:.1}",
+        "adapter {}, from frame {}, distance {:.3}: translation {} × gain {:.1}, rotation {} × gain {:.1}",
+        revision(fitted.adapter.as_ref()),
         fitted.frame_id,
         fitted.distance,
         estimator_text(fitted.translation_estimator()),
@@ -299,6 +300,14 @@ fn motion_text(motion: &pb::Twist) -> String {
         "v ({:.4}, {:.4}, {:.4}) m, ω ({:.4}, {:.4}, {:.4}) rad",
         v.x, v.y, v.z, w.x, w.y, w.z
     )
+}
+
+/// "1 room", "3 rooms".
+fn rooms_text(count: u32) -> String {
+    match count {
+        1 => "1 room".to_owned(),
+        count => format!("{count} rooms"),
+    }
 }
 
 fn revision(revision: Option<&pb::Revision>) -> String {

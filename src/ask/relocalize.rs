@@ -6,7 +6,8 @@ use anyhow::bail;
 use clap::Args;
 
 use super::{
-    Server, ViewCamera, estimate_text, feature_view, image_view, matches_text, revision, wire_json,
+    Server, ViewCamera, estimate_text, feature_view, image_view, matches_text, revision,
+    rooms_text, wire_json,
 };
 use crate::camera::CAMERA_FORM;
 use crate::output::{JsonOutput, say};
@@ -86,8 +87,8 @@ impl Relocalize {
         let answer = self.server.connect().await?.relocalize(request).await?;
 
         say(format_args!(
-            "{} rooms searched: {}",
-            answer.room_count,
+            "{} searched: {}",
+            rooms_text(answer.room_count),
             match answer.ambiguous {
                 true => format!("ambiguous, {}", answer.reason),
                 false => "unambiguous".to_owned(),

@@ -147,8 +147,8 @@ struct Navigation {
     /// Seed of the random navigator
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Plot Hit@ε against ε up to 1, one curve per navigator, to this file:
-    /// .svg, .pdf or .png
+    /// Plot Hit@ε against ε up to 1 to this file, .svg, .pdf or .png: one curve per navigator.
+    /// In-sample refits and other metrics are drawn only if --navigators names them
     #[arg(long, value_name = "FILE", value_parser = plot_file)]
     plot: Option<PathBuf>,
     /// Also write the table to this file: .csv for programs, .tex for LaTeX with booktabs, .md for

@@ -598,8 +598,8 @@ class KeypointMatches:
 
 @dataclass(frozen=True, eq=False)
 class FittedEstimate:
-    """Details of a pose by the adapter that is fitted to the room: the nearest frame, and the gains of the motion
-    from it to the view."""
+    """Details of a pose by the adapter that is fitted to the room: the nearest frame, the gains of the motion
+    from it to the view, and the fitted adapter with its revision."""
 
     frame_id: int
     distance: float
@@ -607,6 +607,7 @@ class FittedEstimate:
     translation_gain: float
     rotation_estimator: str
     rotation_gain: float
+    adapter: Revision | None
 
     @classmethod
     @understood
@@ -622,6 +623,7 @@ class FittedEstimate:
             fitted.translation_gain,
             enum_word(enum, fitted.rotation_estimator, prefix),
             fitted.rotation_gain,
+            _revision(fitted, "adapter"),
         )
 
 

@@ -117,7 +117,7 @@ impl Handlers {
         };
 
         if let Err(error) = &finished {
-            tracing::warn!(grpc_status = i32::from(error.code()), %error, "the evaluation ended without a report");
+            tracing::info!(grpc_status = i32::from(error.code()), %error, "the evaluation ended without a report");
         }
 
         let last = finished

@@ -9,7 +9,7 @@ use tonic::{Request, Response, Status};
 use super::convert;
 use super::cost::{check_batch, check_batch_pixels};
 use super::image_view::{ImageView, RoomMatches, Searched, ViewFields};
-use super::snapshot::{ServedNavigator, ServedRoom};
+use super::snapshot::{FittedReader, ServedNavigator, ServedRoom};
 use super::status::view_error;
 use super::workers::Lane;
 use super::{Error, Handlers, Snapshot};
@@ -20,7 +20,7 @@ use seese3_core::keypoints::KeypointSource;
 use seese3_core::localization::{Place, localize};
 use seese3_core::navigation::{Error as E, Source, Start, StepError};
 use seese3_core::room::{self, FrameId, RoomId};
-use seese3_robot::fitting::{MotionReader, RoomReader};
+use seese3_robot::fitting::MotionReader;
 use seese3_robot::localization::{
     AdapterLocalizer, LocatedView, Method, NotInRoom, NotLocated, PoseEstimate,
 };
@@ -410,7 +410,9 @@ pub(super) fn localizer(served: &ServedNavigator) -> AdapterLocalizer<'_> {
     AdapterLocalizer {
         navigator: &served.navigator,
         map: served.map.as_deref(),
-        reader: served.room_reader().map(|reader| reader as &dyn PoseReader),
+        reader: served
+            .room_reader()
+            .map(|fitted| fitted.reader.as_ref() as &dyn PoseReader),
     }
 }
 
@@ -516,9 +518,9 @@ pub(super) fn matches_to_wire(located: &LocatedView) -> pb::KeypointMatches {
     }
 }
 
-fn fitted_to_wire(reader: &RoomReader, feature: &[f32]) -> Result<pb::FittedEstimate, Error> {
+fn fitted_to_wire(fitted: &FittedReader, feature: &[f32]) -> Result<pb::FittedEstimate, Error> {
     // The feature was checked against the adapter, so an error here is internal.
-    let view = reader.locate(feature).map_err(|_| Error::Internal)?;
+    let view = fitted.reader.locate(feature).map_err(|_| Error::Internal)?;
     Ok(pb::FittedEstimate {
         frame_id: view.nearest.frame.0,
         distance: view.nearest.distance,
@@ -526,6 +528,10 @@ fn fitted_to_wire(reader: &RoomReader, feature: &[f32]) -> Result<pb::FittedEsti
         translation_gain: view.translation.gain,
         rotation_estimator: estimator_to_wire(view.rotation.reader).into(),
         rotation_gain: view.rotation.gain,
+        adapter: Some(pb::Revision {
+            name: fitted.adapter.name.clone(),
+            revision: fitted.adapter.revision,
+        }),
     })
 }
 

@@ -373,6 +373,10 @@ pub fn maps(served: &[Arc<ServedNavigator>]) -> Result<Vec<Arc<Map>>, Error> {
 
         served.map.clone().ok_or_else(|| {
             Error::Precondition(match served.adapter.adapter.error_model() {
+                None if served.adapter.room_fit.is_some() => format!(
+                    "adapter '{name}' is fitted to room '{room}' and neither tracks nor relocalizes by itself: name none, \
+                     or the calibrated adapter from which it was fitted; the fitted one locates its views"
+                ),
                 None => format!(
                     "adapter '{name}' neither tracks nor relocalizes: it is not calibrated in two or more rooms outside \
                      its training set; train it with --calibrate-on"

@@ -92,6 +92,13 @@ impl StatedRevisions {
             }
         }
         match (&self.adapter, other.adapter) {
+            (Some(known), Some(adapter)) if known.0 != adapter.0 => {
+                let problem = format!(
+                    "state revisions of the adapters '{}' and '{}'; send them in different batches",
+                    known.0, adapter.0
+                );
+                return Err(Error::invalid("requests", problem));
+            }
             (Some(known), Some(adapter)) if *known != adapter => {
                 return Err(clash("adapter", &adapter.0));
             }
@@ -202,13 +209,13 @@ impl StatesRevisions for pb::TrackConfig {
 
 impl StatesRevisions for pb::BatchNavigateRequest {
     fn stated_revisions(&self) -> Result<StatedRevisions, Error> {
-        of_batch(&self.requests, |request| &request.adapter)
+        of_batch(&self.requests)
     }
 }
 
 impl StatesRevisions for pb::BatchLocalizeRequest {
     fn stated_revisions(&self) -> Result<StatedRevisions, Error> {
-        of_batch(&self.requests, |request| &request.adapter)
+        of_batch(&self.requests)
     }
 }
 
@@ -216,10 +223,7 @@ impl StatesRevisions for pb::BatchLocalizeRequest {
 ///
 /// # Errors
 /// [`Error::Invalid`] if a request states invalid revisions, or two requests disagree.
-fn of_batch<R: StatesRevisions>(
-    requests: &[R],
-    adapter: impl Fn(&R) -> &str,
-) -> Result<StatedRevisions, Error> {
+fn of_batch<R: StatesRevisions>(requests: &[R]) -> Result<StatedRevisions, Error> {
     let mut all = StatedRevisions {
         room_field: "requests",
         ..StatedRevisions::default()
@@ -235,20 +239,18 @@ fn of_batch<R: StatesRevisions>(
     }
 
     // A request without a revision would be answered from that of another one.
-    let is_pinned = |(request, stated): (&R, &StatedRevisions)| {
+    let is_pinned = |stated: &StatedRevisions| {
         let names = |room: &String| stated.rooms.is_empty() || stated.rooms.contains(room);
         let mut rooms = all.room_revisions.iter().filter(|(room, _)| names(room));
         let has_rooms =
             rooms.all(|(room, revision)| stated.room_revisions.get(room) == Some(revision));
-        let of_adapter = all.adapter.as_ref();
-        let of_adapter = of_adapter.filter(|(name, _)| name == adapter(request));
-        has_rooms && (of_adapter.is_none() || of_adapter == stated.adapter.as_ref())
+        has_rooms && all.adapter == stated.adapter
     };
-    if !all.is_empty() && !requests.iter().zip(&each).all(is_pinned) {
+    if !all.is_empty() && !each.iter().all(is_pinned) {
         return Err(Error::invalid(
             "requests",
-            "state a revision of a room or an adapter that another request names without it; send them \
-             in different batches",
+            "state a revision of a room or an adapter that another request does not state; send them in \
+             different batches",
         ));
     }
 

@@ -244,8 +244,39 @@ impl Error {
                 missing,
                 problem,
             },
+            Self::NotStored {
+                field,
+                missing,
+                problem,
+            } => Self::NotStored {
+                field: format!("{parent}.{field}"),
+                missing,
+                problem,
+            },
             other => other,
         }
+    }
+
+    /// The same error; if the name in `field` is unknown, it names that field.
+    pub fn of_name(self, field: &str) -> Self {
+        match self {
+            Self::NotFound { .. } | Self::NotStored { .. } => self.named(field),
+            other => other,
+        }
+    }
+
+    /// The same error of an upload: its field is one of the upload's `first` message, unless it is
+    /// one of the `later` messages.
+    pub fn of_upload(self, first: &str, later: &[&str]) -> Self {
+        let (Self::Invalid { field, .. }
+        | Self::NotFound { field, .. }
+        | Self::NotStored { field, .. }) = &self
+        else {
+            return self;
+        };
+        let outer = field.split('.').next().unwrap_or_default();
+        let has_path = field.starts_with(&format!("{first}.")) || later.contains(&outer);
+        if has_path { self } else { self.within(first) }
     }
 
     /// The same error with its field replaced by another name.
@@ -258,6 +289,13 @@ impl Error {
             Self::NotFound {
                 missing, problem, ..
             } => Self::NotFound {
+                field: name.to_owned(),
+                missing,
+                problem,
+            },
+            Self::NotStored {
+                missing, problem, ..
+            } => Self::NotStored {
                 field: name.to_owned(),
                 missing,
                 problem,
@@ -476,6 +514,32 @@ impl From<eval::Error> for Error {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Oracle: UploadRoomRequest: its fields are room, frames, keypoints and end.
+    #[test]
+    fn the_field_of_an_upload_is_a_path() {
+        let path = |field: &str| {
+            let error = Error::invalid(field, "is wrong").of_upload("room", &["frames", "end"]);
+            let Error::Invalid { field, .. } = error else {
+                panic!("{error:?}");
+            };
+            field
+        };
+        assert_eq!(path("request_id"), "room.request_id");
+        assert_eq!(path("room"), "room.room");
+        assert_eq!(path("room.mode"), "room.mode");
+        assert_eq!(path("frames"), "frames");
+        assert_eq!(path("frames.features"), "frames.features");
+
+        let unknown = Error::not_found("room", "a", []);
+        assert!(
+            unknown
+                .of_upload("room", &[])
+                .to_string()
+                .starts_with("room.room: ")
+        );
+        assert_eq!(Error::Internal.of_upload("room", &[]), Error::Internal);
+    }
 
     /// Oracle: the hand-written `docs/errors.md`, which has a row with reason and code for each
     /// error.

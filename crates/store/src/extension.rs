@@ -27,6 +27,19 @@ pub enum OtherFeatures {
     LeftBehind,
 }
 
+/// The part of added frames that does not fit a room.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum AddedPart {
+    /// The frames: poses, timestamps, names or segments.
+    Frames,
+    /// The feature sets.
+    Features,
+    /// The camera.
+    Camera,
+    /// The keypoints.
+    Keypoints,
+}
+
 /// An extended room that is not published yet.
 #[derive(Debug)]
 pub struct ExtendedRoom {
@@ -142,13 +155,15 @@ pub(super) fn extended(
         features: added_features,
         keypoints: added_keypoints,
     } = addition;
-    let refused = |problem: Cause| Error::CannotAdd {
+    let refused = |part: AddedPart, problem: Cause| Error::CannotAdd {
         room: base.room.id().to_string(),
+        part,
         problem,
     };
+    let of_keypoints = |problem: String| refused(AddedPart::Keypoints, problem.into());
 
-    let features =
-        joined_features(base, added_features, others).map_err(|problem| refused(problem.into()))?;
+    let features = joined_features(base, added_features, others)
+        .map_err(|problem| refused(AddedPart::Features, problem.into()))?;
     let is_known = |row, added| same_frame(base, row, addition, added, &features);
     if features.len() == base.features.len()
         && let Some(rows) = known_rows(base, addition, is_known)
@@ -158,8 +173,7 @@ pub(super) fn extended(
         let keypoints = if is_there {
             base.keypoints.clone()
         } else {
-            joined_keypoints(base, rows, added_keypoints)
-                .map_err(|problem| refused(problem.into()))?
+            joined_keypoints(base, rows, added_keypoints).map_err(of_keypoints)?
         };
         return Ok(ExtendedRoom {
             room: base.room.clone(),
@@ -171,21 +185,21 @@ pub(super) fn extended(
     }
     if let Some(repeated) = first_repeated(base, addition, is_known) {
         let problem = format!(
-            "the room already has some of these frames, the first in row {repeated}: send only the others"
+            "the room already has some of the added frames, the first of them row {repeated} of the addition: \
+             send only the others"
         );
-        return Err(refused(problem.into()));
+        return Err(refused(AddedPart::Frames, problem.into()));
     }
     let frames = joined_frames(base.room.frames(), addition.frames())
-        .map_err(|problem| refused(problem.into()))?;
+        .map_err(|problem| refused(AddedPart::Frames, problem.into()))?;
 
     let provenance = joined_provenance(base.room.provenance(), addition.provenance())
-        .map_err(|problem| refused(problem.into()))?;
+        .map_err(|problem| refused(AddedPart::Camera, problem.into()))?;
     let room = Room::new(base.room.id().clone(), frames, provenance)
-        .map_err(|error| refused(error.into()))?;
+        .map_err(|error| refused(AddedPart::Frames, error.into()))?;
     let known = base.room.frame_count();
     let rows = known..known + addition.frame_count();
-    let keypoints =
-        joined_keypoints(base, rows, added_keypoints).map_err(|problem| refused(problem.into()))?;
+    let keypoints = joined_keypoints(base, rows, added_keypoints).map_err(of_keypoints)?;
     let is_of_features = |keypoints: &RoomKeypoints| {
         let name = &keypoints.source.feature.name;
         features.iter().any(|set| set.source().name == *name)

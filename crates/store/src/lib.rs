@@ -66,7 +66,7 @@ pub use foreign_adapter::{ForeignAdapter, read_foreign_adapter};
 
 pub use contents::{Contents, RevisionContents, Usage};
 pub use defaults::{Choice, Cleared, Defaults, StandingDefaults};
-pub use extension::{ExtendedRoom, OtherFeatures};
+pub use extension::{AddedPart, ExtendedRoom, OtherFeatures};
 pub use garbage::{Garbage, GarbageFile, GarbagePolicy, Publishers};
 pub use map_edits::EditedRoom;
 pub use publication::{Clock, GRACE, LONGEST_PUBLICATION, UploadPolicy};
@@ -208,6 +208,7 @@ pub enum Error {
     #[error("frames cannot be added to room '{room}': {problem}")]
     CannotAdd {
         room: String,
+        part: AddedPart,
         #[source]
         problem: Cause,
     },

@@ -117,20 +117,22 @@ class KeypointMatches(_message.Message):
     def __init__(self, inliers: _Optional[int] = ..., keypoints: _Optional[int] = ..., frame_ids: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class FittedEstimate(_message.Message):
-    __slots__ = ("frame_id", "distance", "translation_estimator", "translation_gain", "rotation_estimator", "rotation_gain")
+    __slots__ = ("frame_id", "distance", "translation_estimator", "translation_gain", "rotation_estimator", "rotation_gain", "adapter")
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]
     DISTANCE_FIELD_NUMBER: _ClassVar[int]
     TRANSLATION_ESTIMATOR_FIELD_NUMBER: _ClassVar[int]
     TRANSLATION_GAIN_FIELD_NUMBER: _ClassVar[int]
     ROTATION_ESTIMATOR_FIELD_NUMBER: _ClassVar[int]
     ROTATION_GAIN_FIELD_NUMBER: _ClassVar[int]
+    ADAPTER_FIELD_NUMBER: _ClassVar[int]
     frame_id: int
     distance: float
     translation_estimator: RelativeEstimator
     translation_gain: float
     rotation_estimator: RelativeEstimator
     rotation_gain: float
-    def __init__(self, frame_id: _Optional[int] = ..., distance: _Optional[float] = ..., translation_estimator: _Optional[_Union[RelativeEstimator, str]] = ..., translation_gain: _Optional[float] = ..., rotation_estimator: _Optional[_Union[RelativeEstimator, str]] = ..., rotation_gain: _Optional[float] = ...) -> None: ...
+    adapter: _geometry_pb2.Revision
+    def __init__(self, frame_id: _Optional[int] = ..., distance: _Optional[float] = ..., translation_estimator: _Optional[_Union[RelativeEstimator, str]] = ..., translation_gain: _Optional[float] = ..., rotation_estimator: _Optional[_Union[RelativeEstimator, str]] = ..., rotation_gain: _Optional[float] = ..., adapter: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ...) -> None: ...
 
 class SimilarFrame(_message.Message):
     __slots__ = ("room", "frame", "error")

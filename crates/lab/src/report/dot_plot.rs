@@ -5,8 +5,8 @@ use plotters::prelude::*;
 use super::Error;
 use super::table::Table;
 
-/// Width of the names of the rows, pixels.
-const NAMES: u32 = 250;
+/// Width of a character of a name, pixels.
+const CHARACTER: u32 = 7;
 /// Width of a panel, pixels.
 const PANEL: u32 = 170;
 /// Height of a row, pixels.
@@ -16,7 +16,9 @@ const HEAD: u32 = 62;
 /// Height of the labels below the panels, pixels.
 const FOOT: u32 = 40;
 /// Maximum length of a name, characters.
-const LONGEST: usize = 38;
+const LONGEST: usize = 80;
+/// The column that counts what a row is over. It is not drawn.
+const COUNT: &str = "n";
 const COLOR: RGBColor = RGBColor(31, 119, 180);
 
 /// A number of a table, with the interval that the cell states.
@@ -28,7 +30,8 @@ struct Estimate {
 }
 
 impl Estimate {
-    /// Reads a cell: `0.5`, `0.5*`, `12.0 %`, `0.5 ± 0.1` or `0.50 [0.41, 0.59]`.
+    /// Reads a cell: `0.5`, `0.5*`, `12.0 %`, `0.5 ± 0.1` or `0.50 [0.41, 0.59]`. `None` for other
+    /// cells, such as two numbers with their units.
     fn of(cell: &str) -> Option<Self> {
         let (value, rest) = leading_number(cell)?;
         let rest = rest.trim_start();
@@ -39,8 +42,10 @@ impl Estimate {
             let (low, after) = leading_number(interval)?;
             let after = after.trim_start_matches([',', ' ', '–', ';']);
             (low, leading_number(after)?.0)
-        } else {
+        } else if matches!(rest.trim_end(), "" | "*" | "%" | "% *") {
             (value, value)
+        } else {
+            return None;
         };
         Some(Self { value, low, high })
     }
@@ -73,13 +78,44 @@ impl Panel<'_> {
     }
 }
 
-/// Draws a table as an SVG file. Columns without numbers are left out.
+/// The name of each row: its cells in the columns before the first one with numbers, without those
+/// that are the same in every row.
+fn names(rows: &[Vec<String>]) -> Vec<String> {
+    let cell =
+        |row: &[String], place: usize| row.get(place).map_or("", |cell| cell.trim()).to_owned();
+    let has_numbers = |place: usize| {
+        rows.iter()
+            .any(|row| Estimate::of(&cell(row, place)).is_some())
+    };
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
+    let leading: Vec<usize> = std::iter::once(0)
+        .chain((1..columns).take_while(|&place| !has_numbers(place)))
+        .collect();
+
+    let differs = |&place: &usize| {
+        rows.iter()
+            .any(|row| cell(row, place) != cell(&rows[0], place))
+    };
+    let mut named: Vec<usize> = leading.iter().copied().filter(differs).collect();
+    if named.is_empty() {
+        named.push(0);
+    }
+
+    let name = |row: &Vec<String>| {
+        let cells: Vec<String> = named.iter().map(|&place| cell(row, place)).collect();
+        cells.join(" ").trim().chars().take(LONGEST).collect()
+    };
+    rows.iter().map(name).collect()
+}
+
+/// Draws a table as an SVG file. Columns without numbers, and the column `n`, are left out.
 ///
 /// # Errors
 /// [`Error::Picture`] if the table has no numbers, or the drawing library fails.
 pub fn dot_plot(table: &Table, title: &str) -> Result<Vec<u8>, Error> {
     let rows = table.rows();
     let columns = table.titles().iter().enumerate().skip(1);
+    let columns = columns.filter(|(_, title)| *title != COUNT);
     let panels: Vec<Panel<'_>> = columns
         .map(|(place, title)| Panel {
             title,
@@ -96,11 +132,16 @@ pub fn dot_plot(table: &Table, title: &str) -> Result<Vec<u8>, Error> {
         });
     }
 
-    let width = NAMES + PANEL * panels.len() as u32;
+    let names = names(rows);
+    let longest = names.iter().map(|name| name.chars().count()).max();
+    let beside = CHARACTER * longest.unwrap_or(0) as u32 + 24;
+    let width = beside + PANEL * panels.len() as u32;
     let height = HEAD + ROW * rows.len() as u32 + FOOT;
     let mut svg = String::new();
-    draw(&mut svg, (width, height), title, rows, &panels).map_err(|error| Error::Picture {
-        problem: error.to_string().into(),
+    draw(&mut svg, (width, height), title, (&names, beside), &panels).map_err(|error| {
+        Error::Picture {
+            problem: error.to_string().into(),
+        }
     })?;
     Ok(svg.into_bytes())
 }
@@ -109,7 +150,7 @@ fn draw(
     svg: &mut String,
     size: (u32, u32),
     title: &str,
-    rows: &[Vec<String>],
+    (names, beside): (&[String], u32),
     panels: &[Panel<'_>],
 ) -> Result<(), Box<dyn std::error::Error>> {
     let root = SVGBackend::with_string(svg, size).into_drawing_area();
@@ -120,13 +161,16 @@ fn draw(
         ("sans-serif", 17).into_font(),
     ))?;
 
-    for (place, row) in rows.iter().enumerate() {
-        let name: String = row[0].trim().chars().take(LONGEST).collect();
+    for (place, name) in names.iter().enumerate() {
         let y = HEAD as i32 + ROW as i32 * place as i32 + 4;
-        root.draw(&Text::new(name, (8, y), ("sans-serif", 13).into_font()))?;
+        root.draw(&Text::new(
+            name.clone(),
+            (8, y),
+            ("sans-serif", 13).into_font(),
+        ))?;
     }
 
-    let (_, all) = root.split_horizontally(NAMES);
+    let (_, all) = root.split_horizontally(beside);
     let areas = all.split_evenly((1, panels.len()));
     for (panel, area) in panels.iter().zip(areas) {
         let at = (4, HEAD as i32 - 20);
@@ -138,7 +182,7 @@ fn draw(
             .margin_top(HEAD)
             .margin_right(14)
             .x_label_area_size(FOOT)
-            .build_cartesian_2d(x.clone(), rows.len() as f64..0.0)?;
+            .build_cartesian_2d(x.clone(), names.len() as f64..0.0)?;
         chart
             .configure_mesh()
             .disable_y_mesh()
@@ -146,7 +190,7 @@ fn draw(
             .light_line_style(WHITE)
             .draw()?;
         if x.contains(&0.0) {
-            let zero = [(0.0, 0.0), (0.0, rows.len() as f64)];
+            let zero = [(0.0, 0.0), (0.0, names.len() as f64)];
             chart.draw_series(LineSeries::new(zero, BLACK.mix(0.35)))?;
         }
 
@@ -177,9 +221,29 @@ mod tests {
         assert_eq!(Estimate::of("-1.25 ± 0.25*"), estimate(-1.25, -1.5, -1.0));
         assert_eq!(Estimate::of("0.50 [0.40, 0.65]"), estimate(0.5, 0.4, 0.65));
         assert_eq!(Estimate::of("12.5 %"), estimate(12.5, 12.5, 12.5));
-        for cell in ["", "LEAK", "undefined", "NaN", "-"] {
+        for cell in [
+            "",
+            "LEAK",
+            "undefined",
+            "NaN",
+            "-",
+            "0.35 m 5°",
+            "5.0 to 7.0",
+        ] {
             assert_eq!(Estimate::of(cell), None, "{cell}");
         }
+    }
+
+    /// Oracle: by hand: the room is the same in every row, the metric is not.
+    #[test]
+    fn rows_are_named_by_what_differs() {
+        let mut table = Table::new("room | metric | value");
+        table.row("a", ["M1".to_owned(), "0.5".to_owned()]);
+        table.row("a", ["M2".to_owned(), "6".to_owned()]);
+        assert_eq!(names(table.rows()), ["M1", "M2"]);
+
+        table.row("b", ["M1".to_owned(), "0.6".to_owned()]);
+        assert_eq!(names(table.rows()), ["a M1", "a M2", "b M1"]);
     }
 
     /// Oracle: by hand: two columns have numbers, and three cells in all.

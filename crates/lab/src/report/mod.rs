@@ -59,10 +59,10 @@ pub use path_errors::{
 pub use planning::{PlanningJson, planning_json, planning_table};
 #[cfg(feature = "plots")]
 pub use plot_format::{plot_pdf, plot_png};
-pub use probe::{ProbeJson, ProbedRooms, probe_table};
+pub use probe::{ProbeJson, ProbedRooms, probe_plot, probe_table};
 pub use robustness::{RobustnessJson, robustness_json, robustness_table};
 pub use table::{Column, Table, fixed};
-pub use theory::{TheoryJson, theory_json, theory_table};
+pub use theory::{TheoryJson, theory_json, theory_plot, theory_table};
 pub use training::{TrainingJson, training_json, training_remark, training_table};
 
 /// Why a result could not be rendered.

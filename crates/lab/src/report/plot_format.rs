@@ -47,6 +47,8 @@ pub fn plot_png(svg: &[u8]) -> Result<Vec<u8>, Error> {
 fn read(svg: &[u8]) -> Result<usvg::Tree, Error> {
     let mut fonts = usvg::fontdb::Database::new();
     fonts.load_font_data(epaint_default_fonts::UBUNTU_LIGHT.to_vec());
+    // It has the signs that the other one lacks, such as ‖ and →.
+    fonts.load_font_data(epaint_default_fonts::HACK_REGULAR.to_vec());
     let family = fonts.faces().next().map(|face| face.families[0].0.clone());
     fonts.set_sans_serif_family(family.unwrap_or_default());
 

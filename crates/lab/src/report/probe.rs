@@ -43,10 +43,48 @@ impl<'a> ProbedRooms<'a> {
     }
 }
 
+/// What `--plot` draws: one row per room, one column per metric and stride.
+pub fn probe_plot(scores: &[ProbeScores]) -> Table {
+    let of_room = |score: &ProbeScores| -> Vec<(String, f64)> {
+        let m1 = score.m1.as_ref().map(|m1| ("M1".to_owned(), m1.share));
+        let m2 = score.m2.as_ref().into_iter().flat_map(|m2| {
+            [
+                ("M2 TwoNN".to_owned(), m2.dimension.two_nn.linear),
+                ("M2 MLE".to_owned(), m2.dimension.mle_biased.harmonic),
+            ]
+        });
+        let strides = [("M3", &score.m3), ("M4", &score.m4)];
+        let strides = strides.into_iter().flat_map(|(name, strides)| {
+            let named = strides.iter();
+            named.map(move |at| (format!("{name} R², stride {}", at.stride), at.r2))
+        });
+        m1.into_iter().chain(m2).chain(strides).collect()
+    };
+
+    let rooms: Vec<Vec<(String, f64)>> = scores.iter().map(of_room).collect();
+    let mut metrics: Vec<&String> = Vec::new();
+    for (name, _) in rooms.iter().flatten() {
+        if !metrics.contains(&name) {
+            metrics.push(name);
+        }
+    }
+
+    let head: Vec<&str> = metrics.iter().map(|name| name.as_str()).collect();
+    let mut table = Table::new(&format!("room | {}", head.join(" | ")));
+    for (score, found) in scores.iter().zip(&rooms) {
+        let cell = |metric: &&String| {
+            let value = found.iter().find(|(name, _)| name == *metric);
+            value.map_or_else(String::new, |(_, value)| format!("{value:.3}"))
+        };
+        table.row(&score.room, metrics.iter().map(cell));
+    }
+    table
+}
+
 /// One line per room and metric, for M3 and M4 per stride.
 pub fn probe_table(scores: &[ProbeScores]) -> Table {
     let mut table = Table::new(
-        "room | metric | value | sd | transl. | rotation | direct. | magnit. | n | constant | nearest",
+        "room | metric | value | sd | transl. | rotation | direct. | magnit. | n | constant | nearest m | nearest °",
     );
 
     for score in scores {
@@ -100,19 +138,16 @@ fn stride_cells(at: &AtStride) -> Vec<String> {
     cells
 }
 
-/// The R² of the mean training motion and the distance to the nearest training pose; empty for
-/// several rooms together.
-fn baseline_cells(baselines: Option<&Baselines>) -> [String; 2] {
-    let Some(baselines) = baselines else {
-        return [String::new(), String::new()];
-    };
-
-    let nearest = baselines.nearest_pose.map_or_else(String::new, |pose| {
-        format!(
-            "{:.2} m {:.0}°",
-            pose.translation_m,
-            pose.rotation_rad.to_degrees()
-        )
+/// The R² of the mean training motion, and the distance and the angle to the nearest training pose;
+/// empty for several rooms together.
+fn baseline_cells(baselines: Option<&Baselines>) -> [String; 3] {
+    let nearest = baselines.and_then(|baselines| baselines.nearest_pose);
+    let [meters, degrees] = nearest.map_or_else(Default::default, |pose| {
+        [
+            format!("{:.2}", pose.translation_m),
+            format!("{:.0}", pose.rotation_rad.to_degrees()),
+        ]
     });
-    [format!("{:.3}", baselines.constant_r2), nearest]
+    let constant = baselines.map_or_else(String::new, |found| format!("{:.3}", found.constant_r2));
+    [constant, meters, degrees]
 }

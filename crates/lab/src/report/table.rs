@@ -73,6 +73,15 @@ impl Table {
         &self.lines[place + 1]
     }
 
+    /// The lines, with an empty cell where a row has fewer cells than the head.
+    fn full_lines(&self) -> impl Iterator<Item = Vec<String>> {
+        self.lines.iter().map(|cells| {
+            let mut cells = cells.clone();
+            cells.resize(cells.len().max(self.lines[0].len()), String::new());
+            cells
+        })
+    }
+
     /// The table as Markdown.
     pub fn markdown(&self) -> String {
         let line = |cells: &[String]| {
@@ -86,7 +95,7 @@ impl Table {
             .map(|column| if column == 0 { "---" } else { "---:" }.to_owned())
             .collect();
 
-        let rest = self.lines[1..].iter().map(|cells| line(cells));
+        let rest = self.full_lines().skip(1).map(|cells| line(&cells));
         [line(&self.lines[0]), line(&rule)]
             .into_iter()
             .chain(rest)
@@ -96,7 +105,7 @@ impl Table {
     /// The table as HTML.
     pub fn html(&self) -> String {
         let mut body = String::new();
-        for (place, cells) in self.lines.iter().enumerate() {
+        for (place, cells) in self.full_lines().enumerate() {
             let tag = if place == 0 { "th" } else { "td" };
             let cells: String = cells
                 .iter()
@@ -118,29 +127,16 @@ impl Table {
                 cell.to_owned()
             }
         };
-        let line = |cells: &Vec<String>| {
+        let line = |cells: Vec<String>| {
             let cells: Vec<String> = cells.iter().map(quoted).collect();
             cells.join(",") + "\n"
         };
-        self.lines.iter().map(line).collect()
+        self.full_lines().map(line).collect()
     }
 
     /// The table with its cells escaped for LaTeX.
     pub fn escaped_for_latex(&self) -> Self {
-        let escaped = |cell: &String| {
-            let mut text = String::new();
-            for letter in cell.trim().chars() {
-                match letter {
-                    '&' | '%' | '$' | '#' | '_' | '{' | '}' => text.extend(['\\', letter]),
-                    '±' => text.push_str("$\\pm$"),
-                    '²' => text.push_str("$^2$"),
-                    '°' => text.push_str("$^\\circ$"),
-                    'ε' => text.push_str("$\\varepsilon$"),
-                    other => text.push(other),
-                }
-            }
-            text
-        };
+        let escaped = |cell: &String| cell.trim().chars().map(latex_letter).collect();
         let lines = self.lines.iter();
         Self {
             lines: lines
@@ -153,13 +149,47 @@ impl Table {
     pub fn latex(&self) -> String {
         let line = |cells: &[String]| format!("{} \\\\\n", cells.join(" & "));
         let columns = "r".repeat(self.lines[0].len() - 1);
-        let body: String = self.lines[1..].iter().map(|cells| line(cells)).collect();
+        let body: String = self
+            .full_lines()
+            .skip(1)
+            .map(|cells| line(&cells))
+            .collect();
 
         format!(
             "\\begin{{tabular}}{{l{columns}}}\n\\toprule\n{}\\midrule\n{body}\\bottomrule\n\\end{{tabular}}\n",
             line(&self.lines[0])
         )
     }
+}
+
+/// A letter of a table as LaTeX text.
+fn latex_letter(letter: char) -> String {
+    let math = match letter {
+        '&' | '%' | '$' | '#' | '_' | '{' | '}' => return format!("\\{letter}"),
+        '–' => return "--".to_owned(),
+        '±' => "\\pm",
+        '²' => "^2",
+        '°' => "^\\circ",
+        '⁻' => "^-",
+        '¹' => "^1",
+        '½' => "\\frac12",
+        '₁' => "_1",
+        '₂' => "_2",
+        '‖' => "\\|",
+        '·' => "\\cdot",
+        '→' => "\\to",
+        '≤' => "\\le",
+        '≥' => "\\ge",
+        '−' => "-",
+        '∇' => "\\nabla",
+        'Δ' => "\\Delta",
+        'ε' => "\\varepsilon",
+        'λ' => "\\lambda",
+        'ξ' => "\\xi",
+        'ω' => "\\omega",
+        other => return other.to_string(),
+    };
+    format!("${math}$")
 }
 
 /// The width of a terminal that every table fits, characters.

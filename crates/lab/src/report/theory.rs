@@ -16,11 +16,35 @@ pub fn theory_table(checks: &[Check]) -> Table {
             }),
             Text("measured", |check| number(check.measured)),
             Text("bound", |check| bound_text(check.bound)),
-            Text("", |check| {
-                if check.holds() { "" } else { "NOT KEPT" }.to_owned()
+            Text("holds", |check| {
+                if check.holds() { "yes" } else { "NO" }.to_owned()
             }),
         ],
     )
+}
+
+/// What `--plot` draws: where each measured value lies within its bound. From 0 to 1 the bound
+/// holds: 1 is the upper bound, or a lower bound over the value.
+pub fn theory_plot(checks: &[Check]) -> Table {
+    let within = |value: f64, low: f64, high: f64| (value - low) / (high - low);
+    let share = |check: &Check| match check.bound {
+        Bound::AtMost(most) => Some(check.measured / most),
+        Bound::AtLeast(least) => Some(least / check.measured),
+        Bound::Equals(value, tolerance) => {
+            Some(within(check.measured, value - tolerance, value + tolerance))
+        }
+        Bound::Between(low, high) => Some(within(check.measured, low, high)),
+        Bound::Free => None,
+    };
+
+    let mut table = Table::new("theorem: what | within its bound, 0 to 1");
+    for check in checks {
+        if let Some(share) = share(check) {
+            let name = format!("{}: {}", check.theorem, check.what);
+            table.row(name, [format!("{share:.4}")]);
+        }
+    }
+    table
 }
 
 fn number(value: f64) -> String {

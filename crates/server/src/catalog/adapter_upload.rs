@@ -60,7 +60,8 @@ impl Handlers {
                 store.check_adapter_upload(&name.name, policy).await?;
                 Ok(())
             };
-            changes.validated(&caller.id, check).await?;
+            let checked = changes.validated(&caller.id, check).await;
+            checked.map_err(|error| error.of_upload("adapter", &["weights"]))?;
             return Ok(pb::UploadAdapterResponse::default());
         }
 
@@ -84,7 +85,8 @@ impl Handlers {
                 revision: Some(revision),
             }
         };
-        changes.once(identity, change, answer).await
+        let published = changes.once(identity, change, answer).await;
+        published.map_err(|error| error.of_upload("adapter", &["weights"]))
     }
 }
 

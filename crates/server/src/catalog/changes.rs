@@ -21,7 +21,7 @@ use super::recent::{Identity, Recent};
 use seese3_client::proto::v1 as pb;
 use seese3_core::room::is_plain_name;
 use seese3_store::fit_stored_room;
-use seese3_store::{Kind, Published, Quota, Quotas, ResourceName, Scope, Store};
+use seese3_store::{AddedPart, Kind, Published, Quota, Quotas, ResourceName, Scope, Store};
 
 /// Maximum number of queued or running changes.
 const MOST_WAITING: usize = 64;
@@ -405,7 +405,11 @@ impl From<seese3_store::Error> for Error {
                 there: Missing::of(kind, name),
                 problem: format!(
                     "{kind} '{name}' exists in revision {revision} with other content; send \
-                     UPLOAD_MODE_REPLACE for a new revision, or another name"
+                     UPLOAD_MODE_REPLACE for a new revision{}, or another name",
+                    match *kind {
+                        "room" => ", UPLOAD_MODE_EXTEND to add frames",
+                        _ => "",
+                    }
                 ),
             },
             E::InUse { .. } | E::NothingToTakeBack => Self::Precondition(error.to_string()),
@@ -417,7 +421,15 @@ impl From<seese3_store::Error> for Error {
                 Self::invalid("feature_sources", error)
             }
             E::Name { .. } => Self::invalid("name", error),
-            E::CannotAdd { .. } => Self::invalid("frames", error),
+            E::CannotAdd { part, .. } => {
+                let field = match part {
+                    AddedPart::Frames => "frames",
+                    AddedPart::Features => "feature_sources",
+                    AddedPart::Camera => "camera",
+                    AddedPart::Keypoints => "keypoints",
+                };
+                Self::invalid(field, error)
+            }
             E::Absent { .. } => Self::Conflict {
                 name: "the store".to_owned(),
                 problem: "was changed concurrently by another process; retry".to_owned(),

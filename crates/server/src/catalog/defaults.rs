@@ -79,17 +79,22 @@ impl Handlers {
         } = request;
 
         let required = || Error::invalid("default", "is required");
-        let cleared = match default.ok_or_else(required)? {
-            Wire::AdapterOfRoom(room) => Cleared::AdapterOf { room },
-            Wire::RevisionOfRoom(room) => Cleared::RevisionOf(ResourceName::room(room)),
-            Wire::RevisionOfAdapter(adapter) => Cleared::RevisionOf(ResourceName::adapter(adapter)),
+        let (field, kind, name) = match default.ok_or_else(required)? {
+            Wire::AdapterOfRoom(room) => ("adapter_of_room", Kind::Room, room),
+            Wire::RevisionOfRoom(room) => ("revision_of_room", Kind::Room, room),
+            Wire::RevisionOfAdapter(adapter) => ("revision_of_adapter", Kind::Adapter, adapter),
         };
-        check_right(&caller, &cleared.resource())?;
+        let named = resource(kind, &name, None).map_err(|error| error.named(field))?;
+        check_right(&caller, &named)?;
+        let cleared = match field {
+            "adapter_of_room" => Cleared::AdapterOf { room: name },
+            _ => Cleared::RevisionOf(named),
+        };
 
         let answer = |defaults| pb::ClearDefaultResponse { defaults };
         let choice = Choice::Cleared(cleared);
-        self.change_default(caller, identity, choice, validate_only, answer)
-            .await
+        let changed = self.change_default(caller, identity, choice, validate_only, answer);
+        changed.await.map_err(|error| error.of_name(field))
     }
 
     /// Makes a change of the defaults, or only checks it.

@@ -19,6 +19,11 @@ use seese3_client::proto::v1 as pb;
 use seese3_data::pose_check::check_room;
 use seese3_store::{Kind, OtherFeatures, Published, ResourceName, Store, UploadPolicy};
 
+/// An error of an upload, with the path of its field in UploadRoomRequest.
+fn of_upload(error: Error) -> Error {
+    error.of_upload("room", &["frames", "keypoints", "end"])
+}
+
 /// Idle timeout of an upload.
 const SILENCE: Duration = Duration::from_secs(30);
 /// Size of the keypoints of a stored frame in memory, bytes: 300 of 48.
@@ -149,7 +154,10 @@ impl Handlers {
                 store.check_quotas(Some(&room)).await?;
                 check(&uploaded, &store, mode, others).await
             };
-            changes.validated(&caller.id, check).await?;
+            changes
+                .validated(&caller.id, check)
+                .await
+                .map_err(of_upload)?;
             return Ok(pb::UploadRoomResponse::default());
         }
 
@@ -167,7 +175,8 @@ impl Handlers {
                 revision: Some(revision),
             }
         };
-        changes.once(identity, change, answer).await
+        let published = changes.once(identity, change, answer).await;
+        published.map_err(of_upload)
     }
 
     /// Receives the frames of an upload, up to its end message.

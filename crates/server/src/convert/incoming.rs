@@ -557,7 +557,7 @@ pub fn final_norm(given: i32) -> Result<String, Error> {
 
 /// The named navigators of an evaluation. An empty list selects the default navigators.
 pub fn navigators(names: &[String]) -> Result<Vec<NavigatorKind>, Error> {
-    let twice = |(position, name): (usize, &String)| names[..position].contains(name);
+    let twice = |(position, name): &(usize, &String)| names[..*position].contains(name);
 
     if names.len() > MAX_NAVIGATORS {
         return Err(Error::invalid(
@@ -566,8 +566,11 @@ pub fn navigators(names: &[String]) -> Result<Vec<NavigatorKind>, Error> {
         ));
     }
 
-    if names.iter().enumerate().any(twice) {
-        return Err(Error::invalid("navigators", "names a navigator twice"));
+    if let Some((_, name)) = names.iter().enumerate().find(twice) {
+        return Err(Error::invalid(
+            "navigators",
+            format!("names '{name}' twice"),
+        ));
     }
 
     names

@@ -64,13 +64,20 @@ pub struct ServedNavigator {
     /// Whether the adapter was trained on this room.
     pub trained_on: TrainedOn,
     /// Locates single views; only if the adapter was fitted to exactly these frames.
-    pub reader: Option<Arc<RoomReader>>,
+    pub reader: Option<Arc<FittedReader>>,
     /// The keypoints of the room and their source, if it has any.
     pub keypoints: Option<ServedKeypoints>,
     /// Parameters of filters that were fitted to the room.
     pub tracking: Option<FilterParameters>,
     /// The reader of the most preferred fitted adapter, with which the map locates views.
-    pub(super) tracking_reader: Option<Arc<RoomReader>>,
+    pub(super) tracking_reader: Option<Arc<FittedReader>>,
+}
+
+/// Locates single views by an adapter that was fitted to the room.
+pub struct FittedReader {
+    /// The fitted adapter.
+    pub adapter: Arc<StoredAdapter>,
+    pub reader: Arc<RoomReader>,
 }
 
 impl LoadedRoom {
@@ -86,7 +93,7 @@ impl LoadedRoom {
     pub(super) fn under(
         &self,
         adapter: &StoredAdapter,
-        tracking_reader: Option<&Arc<RoomReader>>,
+        tracking_reader: Option<&Arc<FittedReader>>,
     ) -> Option<&Arc<ServedNavigator>> {
         let is_same_reader =
             |served: &ServedNavigator| match (&served.tracking_reader, tracking_reader) {
@@ -115,11 +122,11 @@ impl LoadedRoom {
 }
 
 impl ServedNavigator {
-    /// The reader of an adapter fitted to this room, for features of this adapter's source, if
-    /// there is one; the most preferred if there are several.
-    pub fn room_reader(&self) -> Option<&RoomReader> {
-        let newest = self.tracking_reader.as_ref().or(self.reader.as_ref());
-        newest.map(Arc::as_ref)
+    /// The reader of this adapter if it was fitted to this room; else that of the most preferred
+    /// adapter that was, for features of this adapter's source.
+    pub fn room_reader(&self) -> Option<&FittedReader> {
+        let reader = self.reader.as_ref().or(self.tracking_reader.as_ref());
+        reader.map(Arc::as_ref)
     }
 
     fn is_of(&self, adapter: &StoredAdapter) -> bool {
@@ -129,7 +136,7 @@ impl ServedNavigator {
     fn memory_bytes(&self) -> usize {
         let map = self.map.as_ref().map_or(0, |map| map.memory_bytes());
         let reader = self.reader.as_ref();
-        let reader = reader.map_or(0, |reader| reader.localizer.memory_bytes());
+        let reader = reader.map_or(0, |fitted| fitted.reader.localizer.memory_bytes());
 
         self.navigator.memory_bytes() + map + reader
     }
@@ -139,7 +146,7 @@ impl ServedNavigator {
 pub(super) fn reader_of<'a>(
     navigators: &'a [Arc<ServedNavigator>],
     source: &FeatureSource,
-) -> Option<&'a Arc<RoomReader>> {
+) -> Option<&'a Arc<FittedReader>> {
     navigators
         .iter()
         .filter(|served| served.adapter.adapter.source().is_like(source))

@@ -10,7 +10,7 @@ mod pinned;
 mod served;
 
 pub use content::frames_content;
-pub use loaded::{ServedKeypoints, ServedNavigator};
+pub use loaded::{FittedReader, ServedKeypoints, ServedNavigator};
 pub use loading::{Loader, Refused, RoomMemory};
 use pinned::PinnedRevisions;
 use room_loading::Problem;

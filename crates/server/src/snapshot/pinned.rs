@@ -108,21 +108,22 @@ impl PinnedRevisions {
 }
 
 impl Snapshot {
-    /// This snapshot with the revisions that a request states. Reads the store: call only on
-    /// threads that may block.
+    /// This snapshot with the revisions that a request states. If it states that of the adapter, no
+    /// other adapter that is fitted to a room locates the views of the request. Reads the store:
+    /// call only on threads that may block.
     ///
     /// # Errors
     /// [`Error::NotFound`] if this snapshot has no such room or adapter, or the store no such
     /// revision; [`Error::Precondition`] if the revision cannot be read.
     pub fn with_revisions(self: &Arc<Self>, stated: &StatedRevisions) -> Result<Arc<Self>, Error> {
-        let is_current = stated.room_revisions.iter().all(|(name, revision)| {
-            let room = self.rooms.get(name);
-            room.is_some_and(|room| room.summary.revision == *revision)
-        }) && stated.adapter.iter().all(|(name, revision)| {
-            let adapter = self.adapters.get(name);
-            adapter.is_some_and(|adapter| adapter.revision == *revision)
-        });
-        if is_current {
+        let rooms: Vec<String> = match (stated.rooms.as_slice(), &stated.adapter) {
+            // The adapter may serve any room.
+            ([], Some(_)) => self.rooms.keys().cloned().collect(),
+            ([], None) => stated.room_revisions.keys().cloned().collect(),
+            (named, _) => named.to_vec(),
+        };
+        if self.has_adapter(stated) && rooms.iter().all(|name| self.serves_as_stated(name, stated))
+        {
             return Ok(self.clone());
         }
 
@@ -143,21 +144,48 @@ impl Snapshot {
             snapshot.adapters.insert(name.clone(), adapter);
         }
 
-        let rooms: Vec<String> = match (stated.rooms.as_slice(), &stated.adapter) {
-            // The adapter may serve any room.
-            ([], Some(_)) => self.rooms.keys().cloned().collect(),
-            ([], None) => stated.room_revisions.keys().cloned().collect(),
-            (named, _) => named.to_vec(),
-        };
+        let stated_adapter = stated.adapter.as_ref().map(|(name, _)| name);
+        let mut serving = snapshot.adapters.clone();
+        serving.retain(|name, adapter| {
+            let is_stated = stated_adapter.is_none_or(|stated| stated == name);
+            is_stated || adapter.room_fit.is_none()
+        });
         for name in rooms {
             let current = self.room(&name)?;
+            if self.serves_as_stated(&name, stated) {
+                continue;
+            }
             let revision = stated.room_revisions.get(&name).copied();
             let revision = revision.unwrap_or(current.summary.revision);
-            let room = pinned.room(stated.room_field, &name, revision, &snapshot.adapters)?;
+            let room = pinned.room(stated.room_field, &name, revision, &serving)?;
             snapshot.rooms.insert(name, room);
         }
 
         Ok(Arc::new(snapshot))
+    }
+
+    /// Whether the adapter's current revision is the stated one, if one is stated.
+    fn has_adapter(&self, stated: &StatedRevisions) -> bool {
+        stated.adapter.iter().all(|(name, revision)| {
+            let adapter = self.adapters.get(name);
+            adapter.is_some_and(|adapter| adapter.revision == *revision)
+        })
+    }
+
+    /// Whether a room is served in the stated revision and by the stated adapter, and no other
+    /// adapter is fitted to it.
+    fn serves_as_stated(&self, name: &str, stated: &StatedRevisions) -> bool {
+        let Some(room) = self.rooms.get(name) else {
+            return false;
+        };
+        let revision = stated.room_revisions.get(name);
+        let is_stated = revision.is_none_or(|revision| *revision == room.summary.revision);
+        let is_read_by_another = |candidate: &Candidate| {
+            let stated = stated.adapter.iter();
+            let mut stated = stated.map(|(name, _)| *name == candidate.adapter.name);
+            candidate.adapter.room_fit.is_some() && stated.any(|is_it| !is_it)
+        };
+        is_stated && self.has_adapter(stated) && !room.candidates.iter().any(is_read_by_another)
     }
 }
 

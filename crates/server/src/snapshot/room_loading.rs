@@ -8,7 +8,9 @@ use futures_util::FutureExt;
 
 use super::Refusal;
 use super::content::Content;
-use super::loaded::{Candidate, LoadedRoom, ServedKeypoints, ServedNavigator, reader_of};
+use super::loaded::{
+    Candidate, FittedReader, LoadedRoom, ServedKeypoints, ServedNavigator, reader_of,
+};
 use seese3_core::eval::TrainedOn;
 use seese3_core::features::Features;
 use seese3_core::navigation::{IndexKind, Navigator};
@@ -194,7 +196,7 @@ impl RoomLoader {
         &self,
         loading: &LoadingRoom<'_>,
         adapter: &Arc<StoredAdapter>,
-        tracking_reader: Option<Arc<RoomReader>>,
+        tracking_reader: Option<Arc<FittedReader>>,
     ) -> Result<ServedNavigator, Problem> {
         let LoadingRoom {
             stored,
@@ -238,7 +240,11 @@ impl RoomLoader {
         };
         let reader = match &adapter.room_fit {
             Some(fit) if trained_on == TrainedOn::TheseFrames => {
-                Some(Arc::new(self.room_reader(adapter, fit, &room_data).await?))
+                let reader = self.room_reader(adapter, fit, &room_data).await?;
+                Some(Arc::new(FittedReader {
+                    adapter: adapter.clone(),
+                    reader: Arc::new(reader),
+                }))
             }
             _ => None,
         };
@@ -311,7 +317,7 @@ fn log_audit(navigator: &Navigator, adapter: &str) {
 fn map(
     navigator: &Arc<Navigator>,
     features: &Features,
-    reader: Option<&Arc<RoomReader>>,
+    reader: Option<&Arc<FittedReader>>,
 ) -> Option<Arc<Map>> {
     navigator.adapter().error_model()?;
     let frames: Vec<FrameId> = (0..navigator.room().frame_count() as u32)
@@ -322,7 +328,7 @@ fn map(
         Ok(map) => {
             let map = map.with_features(features.rows(), &frames);
             Some(Arc::new(match reader {
-                Some(reader) => map.with_pose_reader(reader.clone()),
+                Some(fitted) => map.with_pose_reader(fitted.reader.clone()),
                 None => map,
             }))
         }

@@ -80,6 +80,36 @@ async fn send(
         .await
 }
 
+/// Oracle: the contract (docs/defaults.md): the fitted adapter locates the views of another one, and
+/// is named with its revision; a request that states the other one's revision is answered by that
+/// one.
+async fn a_stated_adapter_answers_alone(server: &TestServer) {
+    let localized = async |adapter: &str, adapter_revision| {
+        let request = pb::LocalizeRequest {
+            rooms: vec!["hall".to_owned()],
+            adapter: adapter.to_owned(),
+            adapter_revision,
+            view: feature(served("attic").1.rows().row(40).to_vec()),
+            ..pb::LocalizeRequest::default()
+        };
+        server.client.localize(request).await.unwrap()
+    };
+    let fitted = |answer: &pb::LocalizeResponse| {
+        let fitted = answer.fitted.as_ref()?;
+        assert_eq!(answer.method(), pb::LocalizationMethod::FittedAdapter);
+        let adapter = fitted.adapter.clone().unwrap();
+        Some((adapter.name, adapter.revision))
+    };
+
+    let by_fitted = Some(("hall.made-up.fitted".to_owned(), 2));
+    assert_eq!(fitted(&localized("followed", None).await), by_fitted);
+    let stated = localized("followed", Some(1)).await;
+    assert_eq!(fitted(&stated), None);
+    assert_eq!(stated.method(), pb::LocalizationMethod::SimilarFrames);
+    let stated = localized("hall.made-up.fitted", Some(2)).await;
+    assert_eq!(fitted(&stated), by_fitted);
+}
+
 /// Oracle: the recorded poses. A stream that began before the room grew goes on at its token, in
 /// the grown room; the frames that were added are found; and an adapter is fitted to all of them.
 #[tokio::test]
@@ -128,6 +158,7 @@ async fn streams_and_tokens_survive_the_growth_of_a_room() {
         .await
         .unwrap();
     assert_eq!(localized.frames[0].frame.as_ref().unwrap().frame_id, 340);
+    a_stated_adapter_answers_alone(&server).await;
 
     let rest = followed(resume(token), 60..120);
     let rest = answers(&server, rest).await.unwrap();
