@@ -15,9 +15,9 @@ pub fn theory_table(checks: &[Check]) -> Table {
                 format!("{}: {}", check.theorem, check.what)
             }),
             Text("measured", |check| number(check.measured)),
-            Text("bound", |check| bound_text(check.bound)),
-            Text("holds", |check| {
-                if check.holds() { "yes" } else { "NO" }.to_owned()
+            Text("bound", |check| {
+                let remark = if check.holds() { "" } else { " NOT KEPT" };
+                bound_text(check.bound) + remark
             }),
         ],
     )

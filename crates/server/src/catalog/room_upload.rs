@@ -117,7 +117,7 @@ impl Handlers {
         let mode = upload_mode(upload.mode).map_err(within)?;
         if mode == Mode::Extend {
             let memory = changes.extension_memory(&caller.id, &received.name.name);
-            received.memory.push(memory.await?);
+            received.memory.push(memory.await.map_err(of_upload)?);
         }
 
         let (mut received, end) = self

@@ -151,10 +151,10 @@ impl Snapshot {
             is_stated || adapter.room_fit.is_none()
         });
         for name in rooms {
-            let current = self.room(&name)?;
             if self.serves_as_stated(&name, stated) {
                 continue;
             }
+            let current = self.room(&name)?;
             let revision = stated.room_revisions.get(&name).copied();
             let revision = revision.unwrap_or(current.summary.revision);
             let room = pinned.room(stated.room_field, &name, revision, &serving)?;
@@ -173,10 +173,10 @@ impl Snapshot {
     }
 
     /// Whether a room is served in the stated revision and by the stated adapter, and no other
-    /// adapter is fitted to it.
+    /// adapter is fitted to it. Unknown rooms are left to the request, which names their field.
     fn serves_as_stated(&self, name: &str, stated: &StatedRevisions) -> bool {
         let Some(room) = self.rooms.get(name) else {
-            return false;
+            return !stated.room_revisions.contains_key(name);
         };
         let revision = stated.room_revisions.get(name);
         let is_stated = revision.is_none_or(|revision| *revision == room.summary.revision);

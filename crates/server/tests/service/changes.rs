@@ -313,7 +313,12 @@ async fn a_change_that_is_sent_again_is_made_once() {
     assert!(again.created);
 
     let other = upload("other").send(&server.client).await;
-    refused("another room", other, Code::InvalidArgument, "request_id");
+    refused(
+        "another room",
+        other,
+        Code::InvalidArgument,
+        "room.request_id",
+    );
 
     let delete = pb::DeleteRoomRequest {
         room: "new".to_owned(),

@@ -189,7 +189,7 @@ async fn unfit_extensions_are_refused_and_leave_the_room() {
                 ..upload()
             },
             Code::NotFound,
-            "room",
+            "room.room",
         ),
         (
             pb::RoomUpload {
@@ -217,7 +217,7 @@ async fn unfit_extensions_are_refused_and_leave_the_room() {
                 ..upload()
             },
             Code::InvalidArgument,
-            "frames",
+            "room.feature_sources",
         ),
     ];
 

@@ -148,7 +148,7 @@ async fn frames_that_extend_a_room_have_the_keypoints_that_are_sent() {
     let mut of_another_camera = with.clone();
     of_another_camera.spec.camera.as_mut().unwrap().fx *= 1.001;
     let answer = of_another_camera.send(&server.client).await;
-    refused("camera", answer, Code::InvalidArgument, "frames");
+    refused("camera", answer, Code::InvalidArgument, "keypoints");
 
     let answer = with.send(&server.client).await.unwrap();
     assert_eq!(answer.revision.unwrap().revision, 2);
