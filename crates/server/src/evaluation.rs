@@ -117,7 +117,12 @@ impl Handlers {
         };
 
         if let Err(error) = &finished {
-            tracing::info!(grpc_status = i32::from(error.code()), %error, "the evaluation ended without a report");
+            let grpc_status = i32::from(error.code());
+            if matches!(error, Error::Internal) {
+                tracing::warn!(grpc_status, %error, "the evaluation ended without a report");
+            } else {
+                tracing::info!(grpc_status, %error, "the evaluation ended without a report");
+            }
         }
 
         let last = finished

@@ -295,3 +295,20 @@ pub(super) fn escaped(text: &str) -> String {
         .replace('>', "&gt;")
         .replace('"', "&quot;")
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: by hand; RFC 4180 wants the same number of cells in every line.
+    #[test]
+    fn short_rows_are_filled_and_signs_are_math() {
+        let mut table = Table::new("a | b | c");
+        table.row("‖x‖ ≤ ½", ["1".to_owned()]);
+        assert_eq!(table.csv(), "a,b,c\n‖x‖ ≤ ½,1,\n");
+
+        let latex = table.escaped_for_latex().latex();
+        let row = "$\\|$x$\\|$ $\\le$ $\\frac12$ & 1 &  \\\\\n";
+        assert!(latex.contains(row), "{latex}");
+    }
+}

@@ -95,3 +95,29 @@ pub fn theory_json(checks: &[Check]) -> TheoryJson {
         checks: checks.iter().map(entry).collect(),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: by hand.
+    #[test]
+    fn a_plot_shows_where_in_its_bound_a_value_lies() {
+        let check = |measured, bound| Check {
+            theorem: "1",
+            what: "a",
+            measured,
+            bound,
+        };
+        let checks = [
+            check(1.0, Bound::AtMost(4.0)),
+            check(4.0, Bound::AtLeast(2.0)),
+            check(2.0, Bound::Equals(2.0, 0.1)),
+            check(6.0, Bound::Between(1.0, 5.0)),
+            check(1.0, Bound::Free),
+        ];
+        let drawn = theory_plot(&checks);
+        let shares: Vec<&str> = drawn.rows().iter().map(|row| row[1].as_str()).collect();
+        assert_eq!(shares, ["0.2500", "0.5000", "0.5000", "1.2500"]);
+    }
+}

@@ -79,17 +79,20 @@ impl Handlers {
         } = request;
 
         let required = || Error::invalid("default", "is required");
-        let (field, kind, name) = match default.ok_or_else(required)? {
-            Wire::AdapterOfRoom(room) => ("adapter_of_room", Kind::Room, room),
-            Wire::RevisionOfRoom(room) => ("revision_of_room", Kind::Room, room),
-            Wire::RevisionOfAdapter(adapter) => ("revision_of_adapter", Kind::Adapter, adapter),
+        let (field, cleared) = match default.ok_or_else(required)? {
+            Wire::AdapterOfRoom(room) => ("adapter_of_room", Cleared::AdapterOf { room }),
+            Wire::RevisionOfRoom(room) => (
+                "revision_of_room",
+                Cleared::RevisionOf(ResourceName::room(room)),
+            ),
+            Wire::RevisionOfAdapter(adapter) => (
+                "revision_of_adapter",
+                Cleared::RevisionOf(ResourceName::adapter(adapter)),
+            ),
         };
-        let named = resource(kind, &name, None).map_err(|error| error.named(field))?;
+        let named = cleared.resource();
+        resource(named.kind, &named.name, None).map_err(|error| error.named(field))?;
         check_right(&caller, &named)?;
-        let cleared = match field {
-            "adapter_of_room" => Cleared::AdapterOf { room: name },
-            _ => Cleared::RevisionOf(named),
-        };
 
         let answer = |defaults| pb::ClearDefaultResponse { defaults };
         let choice = Choice::Cleared(cleared);
