@@ -26,8 +26,8 @@ use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::{Twist, exp};
 use seese3_core::index::{ExactIndex, HnswIndex, HnswParameters, Index};
 use seese3_core::navigation::{
-    FitOn, IndexKind, Limits, Mode, Navigator, Query, Reading, RequestedMotion, RetrievalMetric,
-    Source, SourceAt, StepKind,
+    FitOn, IndexKind, Limits, Method, Mode, Navigator, Query, Reading, RequestedMotion,
+    RetrievalMetric, Source, SourceAt, StepKind,
 };
 use seese3_core::room::{FrameId, Frames, Provenance, Room, RoomId};
 
@@ -119,8 +119,10 @@ fn query(steps: u32) -> Query {
         motion: RequestedMotion::Twists(vec![twist]),
         steps,
         mode: Mode::OpenLoop,
-        step: StepKind::InversePoincare(Reading::Homogeneous),
-        metric: RetrievalMetric::Full,
+        method: Method::Latent(
+            StepKind::InversePoincare(Reading::Homogeneous),
+            RetrievalMetric::Full,
+        ),
         fit_on: FitOn {
             split: seese3_core::splits::Split::Time,
             stride: 40,
@@ -320,6 +322,7 @@ async fn serve(folder: &str) -> (Client, tonic::transport::Channel) {
         test: seese3_core::motion_scores::MotionScores::of(&twists(9), &twists(9)),
         train: seese3_core::motion_scores::MotionScores::of(&twists(9), &twists(9)),
         train_mean_r2: 0.0,
+        relational: None,
     };
 
     store

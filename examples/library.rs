@@ -11,8 +11,8 @@ use seese3_core::adapter::{Preset, Reading};
 use seese3_core::cancel::Cancellation;
 use seese3_core::features::Features;
 use seese3_core::navigation::{
-    FitOn, IndexKind, Limits, Mode, Navigator, Query, RequestedMotion, RetrievalMetric, Source,
-    SourceAt, StepKind,
+    FitOn, IndexKind, Limits, Method, Mode, Navigator, Query, RequestedMotion, RetrievalMetric,
+    Source, SourceAt, StepKind,
 };
 use seese3_core::ndarray::Array2;
 use seese3_core::room::{FrameId, Frames, Provenance, Room, RoomId};
@@ -70,8 +70,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         motion: RequestedMotion::TargetFrame(FrameId(70)),
         steps: 4,
         mode: Mode::OpenLoop,
-        step: StepKind::InversePoincare(Reading::Homogeneous),
-        metric: RetrievalMetric::Full,
+        method: Method::Latent(
+            StepKind::InversePoincare(Reading::Homogeneous),
+            RetrievalMetric::Full,
+        ),
         fit_on: FitOn {
             split: Split::Time,
             stride: STRIDE,

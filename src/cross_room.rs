@@ -8,7 +8,7 @@ use super::evaluate::navigators_named;
 use super::named::one_of;
 use super::output::say;
 use super::progress::bar;
-use super::protocol::ProtocolOptions;
+use super::protocol::{ProtocolOptions, ReaderOptions};
 use super::rooms::{data, load_rooms, room_words};
 use super::store_option::StoreAndJson;
 use crate::table_files::TableFiles;
@@ -38,7 +38,7 @@ pub struct CrossRoom {
     #[arg(long, required = true)]
     test: Vec<String>,
     /// Name of the feature set, the same for every room; may be omitted when the first training
-    /// room has only one
+    /// room has only one. Several names, separated by commas, are joined column by column
     #[arg(long)]
     features: Option<String>,
     /// Room counts of the scaling curve, separated by commas; each count includes the
@@ -58,12 +58,14 @@ pub struct CrossRoom {
     seed: u64,
     #[command(flatten)]
     protocol: ProtocolOptions,
+    #[command(flatten)]
+    reader: ReaderOptions,
     /// Split of the held-out rooms: selects the test pairs and the candidate frames for retrieval
     #[arg(long, value_parser = one_of::<Split>(), default_value = "whole")]
     test_split: Split,
     /// Navigators by name, separated by commas; if omitted: identity, inverse Poincaré (affine and
     /// homogeneous; with --calibration-rooms also +calibrated) and the ridge refits that the test
-    /// split allows
+    /// split allows; with --reader also relational
     #[arg(long, value_delimiter = ',')]
     navigators: Vec<String>,
     /// Baseline navigator that the others' Hit@ε is compared with
@@ -135,8 +137,10 @@ impl CrossRoom {
         check_thresholds(&protocol.thresholds)?;
         let plan = self.protocol.plan(self.seed)?;
         let progress = bar(
-            (sizes.len() as u64) * self.seeds * (plan.config.epochs + test.len()) as u64,
-            "rooms",
+            (sizes.len() as u64)
+                * self.seeds
+                * (plan.config.epochs + self.reader.epochs() + test.len()) as u64,
+            "epochs and rooms",
         );
 
         let held_out: Vec<RoomData<'_>> = test.iter().map(data).collect();
@@ -155,6 +159,7 @@ impl CrossRoom {
                     &held_out,
                     &CrossRoomPlan {
                         training: &plan.with_seed(seed),
+                        relational: self.reader.relational(seed),
                         calibration_rooms: self.calibration_rooms,
                         protocol: &protocol,
                     },
@@ -242,6 +247,10 @@ impl CrossRoom {
                 names.push("ridge-refit-z-scored".to_owned());
             }
             names.push("ridge-refit-z-scored-in-sample".to_owned());
+
+            if self.reader.relational(self.seed).is_some() {
+                names.push(NavigatorKind::Relational.name());
+            }
         }
         let mut navigators = navigators_named(&names)?;
 
@@ -267,6 +276,9 @@ impl CrossRoom {
                         "--navigators: '{}' needs training pairs, and --test-split whole has none",
                         kind.name()
                     );
+                }
+                NavigatorKind::Relational if self.reader.relational(self.seed).is_none() => {
+                    bail!("--navigators: 'relational' needs a reader; give --reader relational");
                 }
                 _ => {}
             }

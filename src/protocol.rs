@@ -6,9 +6,52 @@ use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 
 use super::named::{one_of, possible_values};
 
-use seese3_core::adapter::{Loss, Mixing, PairPlan, Preset};
+use seese3_core::adapter::{Loss, Mixing, PairPlan, Preset, RelationalConfig};
 use seese3_core::splits::{Split, StrideRange};
 use seese3_core::training::TrainingPlan;
+
+/// A reader beside the paper's adapter.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Reader {
+    /// Reads motions from the similarities of all cells of two feature maps
+    ///
+    /// Ours, not the paper's. Needs features of a grid (`encode --pool grid4x4`).
+    Relational,
+}
+
+/// Options of a reader that is trained beside the adapter.
+#[derive(Debug, Clone, Args)]
+pub struct ReaderOptions {
+    /// Also train a reader of this kind on the same features
+    #[arg(long, value_enum)]
+    reader: Option<Reader>,
+    /// Number of networks of the reader, whose densities are averaged, 1 to 16
+    #[arg(long, default_value_t = 1, requires = "reader")]
+    reader_members: usize,
+    /// Number of epochs of the reader, 1 to 100000, for each network; 24 if omitted. An epoch has
+    /// 25600 pairs
+    #[arg(long, requires = "reader")]
+    reader_epochs: Option<usize>,
+}
+
+impl ReaderOptions {
+    /// Number of epochs of all networks of the reader; 0 without one.
+    pub fn epochs(&self) -> usize {
+        let config = self.relational(0);
+        config.map_or(0, |config| config.epochs.saturating_mul(config.members))
+    }
+
+    /// Settings of the relational reader, if one is requested.
+    pub fn relational(&self, seed: u64) -> Option<RelationalConfig> {
+        let default = RelationalConfig::default();
+        self.reader.map(|Reader::Relational| RelationalConfig {
+            members: self.reader_members,
+            epochs: self.reader_epochs.unwrap_or(default.epochs),
+            seed,
+            ..default
+        })
+    }
+}
 
 /// A training preset, with options that override single settings.
 #[derive(Debug, Clone, Args)]

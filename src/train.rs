@@ -3,17 +3,22 @@
 use anyhow::{Context, bail};
 use clap::Args;
 
-use seese3_core::adapter::{Adapter, CorrectorKind, TrainingRecord};
-use seese3_core::features::Features;
+use seese3_core::adapter::{
+    Adapter, CellLayout, CorrectorKind, RelationalConfig, RelationalReader, TrainingRecord,
+};
+use seese3_core::features::{Features, JOINED};
+use seese3_core::motion_scores::MotionScores;
 use seese3_core::splits::Split;
-use seese3_core::training::{RoomData, TrainingPlan};
+use seese3_core::training::{
+    RoomData, TrainingPlan, motions, relational_predictions, train_reader,
+};
 use seese3_lab::experiments::seeds::{SeededTraining, TrainingRun, train_seeds};
 use seese3_lab::report::{training_json, training_remark, training_table};
 use seese3_robot::calibration::{calibrate, check_unseen};
 
 use super::output::{JsonOutput, say, say_published};
 use super::progress::bar;
-use super::protocol::ProtocolOptions;
+use super::protocol::{ProtocolOptions, ReaderOptions};
 use super::rooms::{data, load_rooms, room_words};
 use seese3_store::{Store, StoredRoom};
 
@@ -30,11 +35,13 @@ pub struct Train {
     #[arg(long = "room", required = true)]
     rooms: Vec<String>,
     /// Name of the feature set, the same for every room; may be omitted when the first room has
-    /// only one
+    /// only one. Several names, separated by commas, are joined column by column
     #[arg(long)]
     features: Option<String>,
     #[command(flatten)]
     protocol: ProtocolOptions,
+    #[command(flatten)]
+    reader: ReaderOptions,
     /// Corrector navigators to train after the adapter, separated by commas: linear, mlp-2, mlp-3,
     /// attention, or all; none if omitted
     #[arg(long, value_delimiter = ',')]
@@ -83,6 +90,12 @@ impl Train {
             false => load_rooms(&store, &self.calibrate_on, Some(&source)).await?,
         };
 
+        // Found now, not after the training of the adapter.
+        let reader = self.reader.relational(self.seed);
+        if reader.is_some() {
+            CellLayout::of(rooms[0].1.source())?;
+        }
+
         // Errors in a training room are not representative of other rooms. Reject such a
         // calibration room now, not after the training.
         for room in &calibration {
@@ -98,6 +111,11 @@ impl Train {
             mut adapter,
             mut runs,
         } = train_with_progress(&rooms, &plan, self.seeds)?;
+        if let Some(config) = reader {
+            let reader = reader_with_progress(&rooms, plan.split, &config)?;
+            adapter = adapter.with_relational(reader)?;
+            runs[0].record.relational = Some(config);
+        }
         if !calibration.is_empty() {
             let record = runs[0].record.clone();
             (adapter, runs[0].record) = calibrated(adapter, record, &calibration)?;
@@ -110,41 +128,46 @@ impl Train {
             .publish_adapter(&name, &adapter, record, features.rows())
             .await?;
 
-        let split = plan.split;
-        let stride = plan.stride;
-        let preset = plan.preset.name();
-
-        say(format_args!(
-            "{}, features '{}' ({} columns), preset {preset}, stride {stride}, split {split}",
-            room_words(&rooms),
-            features.source().name,
-            features.source().dim,
-        ));
-
-        // Under `whole` nothing is held out: the scores are in-sample and labeled as such.
-        let judged = match split {
-            Split::Whole => {
-                "no test pairs; train R², and in-sample Hit@0.1 of inverse Poincaré (affine)"
-                    .to_owned()
-            }
-            _ => format!(
-                "{} test pairs; test R² by room, averaged, and Hit@0.1 of inverse Poincaré (affine)",
-                record.test.n
-            ),
-        };
-
-        say(format_args!(
-            "{} training pairs, {} epochs\n{judged}:",
-            record.pair_count, record.config.epochs
-        ));
-
+        say_training(&rooms, &plan, record);
         say_scores(&runs);
+        say_reader(&adapter, &rooms, &plan)?;
         say_published(&store, &format!("adapter '{name}'"), &published);
         self.json
             .write(&training_json(&runs, &name, published.revision))?;
 
         Ok(())
     }
+}
+
+/// Prints what was trained on, and on what it is judged.
+fn say_training(rooms: &[(StoredRoom, Features)], plan: &TrainingPlan, record: &TrainingRecord) {
+    let features = &rooms[0].1;
+    let split = plan.split;
+    let stride = plan.stride;
+    let preset = plan.preset.name();
+
+    say(format_args!(
+        "{}, features '{}' ({} columns), preset {preset}, stride {stride}, split {split}",
+        room_words(rooms),
+        features.source().name,
+        features.source().dim,
+    ));
+
+    // Under `whole` nothing is held out: the scores are in-sample and labeled as such.
+    let judged = match split {
+        Split::Whole => {
+            "no test pairs; train R², and in-sample Hit@0.1 of inverse Poincaré (affine)".to_owned()
+        }
+        _ => format!(
+            "{} test pairs; test R² by room, averaged, and Hit@0.1 of inverse Poincaré (affine)",
+            record.test.n
+        ),
+    };
+
+    say(format_args!(
+        "{} training pairs, {} epochs\n{judged}:",
+        record.pair_count, record.config.epochs
+    ));
 }
 
 /// Prints the table of seeds, with its caveats.
@@ -162,6 +185,54 @@ fn say_scores(runs: &[TrainingRun]) {
             "{still} of the 6 components of the motion never vary and are left out of the means"
         ));
     }
+}
+
+/// Trains a relational reader with a progress bar, which shows the loss reported last.
+pub fn reader_with_progress(
+    rooms: &[(StoredRoom, Features)],
+    split: Split,
+    config: &RelationalConfig,
+) -> anyhow::Result<RelationalReader> {
+    let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
+    let epochs = (config.epochs as u64).saturating_mul(config.members as u64);
+    let progress = bar(epochs, "training the reader");
+    let reader = train_reader(&room_data, split, config, &mut |epoch| {
+        progress.set_message(format!("loss {:.3}", epoch.loss));
+        progress.inc(1);
+    })?;
+
+    progress.finish_and_clear();
+    Ok(reader)
+}
+
+/// Prints the scores of the relational reader on the test pairs, if there are both.
+fn say_reader(
+    adapter: &Adapter,
+    rooms: &[(StoredRoom, Features)],
+    plan: &TrainingPlan,
+) -> anyhow::Result<()> {
+    let Some(reader) = adapter.relational() else {
+        return Ok(());
+    };
+    if plan.split == Split::Whole {
+        say("relational reader: no test pairs; judge it in rooms that it was not trained on");
+        return Ok(());
+    }
+
+    let mut scores = Vec::with_capacity(rooms.len());
+    for (stored, features) in rooms {
+        let pairs = plan.split.test_pairs(stored.room.timeline(), plan.stride)?;
+        let truth = motions(stored.room.poses(), &pairs);
+        let read = relational_predictions(reader, features.rows(), &pairs)?;
+        scores.push(MotionScores::of(&truth, &read));
+    }
+
+    let mean = MotionScores::mean(&scores);
+    say(format_args!(
+        "relational reader: test R² {:.3}, translation {:.3}, rotation {:.3}",
+        mean.overall, mean.translation, mean.rotation
+    ));
+    Ok(())
 }
 
 /// The adapter with its errors measured in the calibration rooms, and its finished record.
@@ -238,6 +309,9 @@ pub fn default_name(rooms: &[(StoredRoom, Features)], plan: &TrainingPlan) -> St
         "{first}{others}.{features}.{}.s{stride}.{split}",
         preset.name()
     );
+
+    // Joined features have a separator that names cannot contain.
+    name = name.replace(JOINED, "-");
 
     // Other settings, such as epochs and rates, do not enter the name; adapters that differ only
     // in them become revisions of one name.

@@ -49,6 +49,10 @@ pub struct Motion {
     /// Two rows of the --feature-file, A,B, counted from 0
     #[arg(long, value_delimiter = ',', value_name = "A,B")]
     rows: Option<Vec<usize>>,
+    /// Estimate the motion with the adapter's relational reader, which compares the cells of both
+    /// feature maps and needs no camera
+    #[arg(long, conflicts_with = "camera")]
+    relational: bool,
     #[command(flatten)]
     json: JsonOutput,
 }
@@ -90,6 +94,10 @@ impl Motion {
             first: Some(first),
             second: Some(second),
             camera,
+            estimator: match self.relational {
+                true => pb::MotionEstimator::Relational.into(),
+                false => pb::MotionEstimator::Unspecified.into(),
+            },
             ..pb::EstimateMotionRequest::default()
         };
 
@@ -109,6 +117,10 @@ impl Motion {
             pb::MotionEstimator::None => {
                 say("the images have too little in common: no motion was estimated");
             }
+            pb::MotionEstimator::Relational => say(format_args!(
+                "relational reader of adapter {}",
+                revision(answer.adapter.as_ref())
+            )),
             pb::MotionEstimator::Adapter | pb::MotionEstimator::Unspecified => say(format_args!(
                 "adapter {}",
                 revision(answer.adapter.as_ref())

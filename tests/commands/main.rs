@@ -16,6 +16,7 @@ mod manners;
 #[cfg(feature = "onnx")]
 mod matched_views;
 mod program;
+mod relational;
 mod research;
 mod rooms;
 mod schemas;

@@ -442,6 +442,7 @@ class AsyncClient:
         adapter: str | None = None,
         adapter_revision: int | None = None,
         camera: Camera | Literal["mapping"] | None = None,
+        relational: bool = False,
         deadline_s: float | None = None,
     ) -> answers.Motion:
         """Estimates the motion from one view to another.
@@ -456,6 +457,8 @@ class AsyncClient:
             adapter_revision: The revision of `adapter`; None for the current one.
             camera: The camera of both images, or "mapping" for the one that mapped `room`; None for that of the room,
                 if it is known.
+            relational: Whether to use the adapter's relational reader, which compares the cells of both feature maps
+                and needs no camera.
             deadline_s: Time limit of the call, seconds; None for that of the client.
 
         Returns:
@@ -475,6 +478,7 @@ class AsyncClient:
             first=wire_view(first),
             second=wire_view(second),
             camera=requests.wire_view_camera(camera),
+            estimator="MOTION_ESTIMATOR_RELATIONAL" if relational else None,
         )
         return answers.Motion.of(await self._ask(self._odometry.EstimateMotion, request, deadline_s))
 

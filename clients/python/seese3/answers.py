@@ -933,8 +933,9 @@ class Route:
 class Motion:
     """The motion (6,) from one view to another.
 
-    `covariance` (6, 6) is that of the six numbers; None if an adapter estimated the motion. `estimator` is "adapter",
-    "two_view" (matched keypoints), or "none": the views have too little in common.
+    `covariance` (6, 6) is that of the six numbers; None if an adapter estimated the motion from latents, or is not
+    calibrated. `estimator` is "adapter", "two_view" (matched keypoints), "relational" (the relational reader of the
+    adapter), or "none": the views have too little in common.
     """
 
     twist: Array

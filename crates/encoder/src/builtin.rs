@@ -47,6 +47,7 @@ pub fn builtin_source(name: &str) -> FeatureSource {
         pooling: POOLING.to_string(),
         preprocess: preparation().describe(1),
         dim: BUILTIN_DIM,
+        parts: Vec::new(),
     }
 }
 

@@ -355,6 +355,17 @@ impl Encoder {
         models: &[String],
         runtime: &Runtime,
     ) -> Result<Option<Self>, Error> {
+        // Joined features are computed in one pass, so all parts have the same model and
+        // preparation.
+        let parts = source.parts();
+        let first = &parts[0];
+        let is_one_pass = |part: &FeatureSource| {
+            part.encoder == first.encoder && part.preprocess == first.preprocess
+        };
+        if !parts.iter().all(is_one_pass) {
+            return Ok(None);
+        }
+
         for model in models {
             let plain = match model.as_str() {
                 "builtin" => Some(Self::builtin()),
@@ -372,25 +383,28 @@ impl Encoder {
             }
 
             let file = Path::new(model);
-            if model_file::identity(file)? != source.encoder {
+            if model_file::identity(file)? != first.encoder {
                 continue;
             }
 
             // The file is the right one; everything else about the encoder is read back from the
             // source.
-            let (preparation, window) = Preparation::parse(&source.preprocess)?;
+            let (preparation, window) = Preparation::parse(&first.preprocess)?;
 
-            let layer = Layer {
-                name: source.layer.clone(),
-                base: source.base.clone(),
-                norm: source.norm.clone(),
-                pooling: source.pooling.parse()?,
-            };
+            let mut layers = Vec::with_capacity(parts.len());
+            for part in parts {
+                layers.push(Layer {
+                    name: part.layer.clone(),
+                    base: part.base.clone(),
+                    norm: part.norm.clone(),
+                    pooling: part.pooling.parse()?,
+                });
+            }
 
             let task = ModelTask {
                 file: file.to_owned(),
                 preparation,
-                layers: vec![layer],
+                layers,
                 window,
                 keypoints,
                 is_prefix_stated: true,
@@ -414,6 +428,7 @@ impl Encoder {
             pooling: layer.pooling.to_string(),
             preprocess: self.preparation.describe(self.window),
             dim,
+            parts: Vec::new(),
         };
 
         self.layers.iter().zip(&self.dims).map(made).collect()

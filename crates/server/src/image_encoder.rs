@@ -144,8 +144,9 @@ impl ImageEncoder {
 
     /// Whether the features of this encoder are those of `source`.
     pub fn makes(&self, source: &FeatureSource) -> bool {
-        let made = self.encoder.sources("");
-        made.iter().any(|made| made.is_like(source))
+        // A feature has the columns of all layers, one after the other.
+        let made = FeatureSource::joined(&self.encoder.sources(""));
+        made.is_ok_and(|made| made.is_like(source))
     }
 }
 

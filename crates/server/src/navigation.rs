@@ -131,7 +131,7 @@ fn navigate(
             .collect(),
         adapter: Some(adapter.clone()),
         step_mode: convert::mode_to_wire(query.mode).into(),
-        inverse_variant: convert::variant_to_wire(query.step).into(),
+        inverse_variant: convert::variant_to_wire(query.method).into(),
         navigator: convert::navigator_to_wire(&query),
         motion: answer.motion.map(|twist| convert::twist_to_wire(&twist)),
         exact: served.navigator.audit().is_none(),

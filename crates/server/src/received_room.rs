@@ -368,8 +368,14 @@ fn source(given: &pb::FeatureSource) -> Result<FeatureSource, Error> {
         dim,
         layer_index_base,
         final_norm,
+        parts,
     } = given.clone();
     let dim = dim as usize;
+
+    if !parts.is_empty() {
+        let problem = "upload the parts of joined features as feature sets of their own";
+        return Err(Error::invalid("feature_sources.parts", problem));
+    }
 
     if !is_plain_name(&name) {
         let problem =
@@ -398,5 +404,6 @@ fn source(given: &pb::FeatureSource) -> Result<FeatureSource, Error> {
         pooling: or_unspecified("pooling", pooling)?,
         preprocess: or_unspecified("preprocess", preprocess)?,
         dim,
+        parts: Vec::new(),
     })
 }

@@ -436,6 +436,7 @@ impl From<navigation::Error> for Error {
             E::TopK { .. } | E::FramesInAnswer { .. } => "top_k",
             E::NoTwist | E::TwistNotFinite { .. } | E::TwistBeyondPi { .. } => "motion",
             E::PoseNeeded { .. } => "source_pose",
+            E::ViewNeeded => "source.latent",
             E::NoCandidates { .. } => "exclude_radius",
         };
 
@@ -448,7 +449,11 @@ fn lacks_method(error: &adapter::Error) -> bool {
     use adapter::Error as E;
     matches!(
         error,
-        E::NoCorrector { .. } | E::NoErrorCovariance | E::GatedMotion | E::WhitenedColumns { .. }
+        E::NoCorrector { .. }
+            | E::NoRelational
+            | E::NoErrorCovariance
+            | E::GatedMotion
+            | E::WhitenedColumns { .. }
     )
 }
 

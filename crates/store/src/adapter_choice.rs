@@ -64,9 +64,7 @@ pub struct RoomAdapters<'a> {
 /// Whether an adapter serves a room that has features of these sources. An adapter that is fitted
 /// to a room serves only that room.
 pub fn serves(adapter: &StoredAdapter, room: &RoomId, sources: &[FeatureSource]) -> bool {
-    let has_features = sources
-        .iter()
-        .any(|source| source.is_like(adapter.adapter.source()));
+    let has_features = adapter.adapter.source().is_among(sources);
     let is_of_another = |fit: &RoomFit| fit.room != *room;
 
     has_features && !adapter.room_fit.as_ref().is_some_and(is_of_another)

@@ -8,11 +8,11 @@ use ndarray::{Array2, ArrayView2};
 
 use super::format::{AdapterBody, TrainingEntry};
 use super::stored_adapter::{RoomFit, StoredAdapter};
-use super::tensors::{TensorReader, TensorWriter};
-use super::{Error, error_model, manifest, room_fit, sha256};
+use super::tensors::{TensorReader, TensorWriter, read_weights};
+use super::{Error, error_model, manifest, relational_reader, room_fit, sha256};
 use seese3_core::Cause;
 use seese3_core::adapter::{
-    self, Adapter, Corrector, CorrectorKind, Mixture, Network, TargetScale,
+    self, Adapter, Corrector, CorrectorKind, Mixture, Network, TargetScale, TrainingRecord,
 };
 
 /// The frame of every twist: the body frame of the source camera.
@@ -131,7 +131,18 @@ pub(super) fn assembled(
     // The checksums prove that the file is intact. The golden vectors prove that this program, on
     // this machine, still computes the same function.
     check_golden(&adapter, &tensors, file)?;
-    let record = body.training.into();
+    let record = TrainingRecord::from(body.training);
+
+    // Its own golden motions are checked while it is read.
+    let adapter = match &record.relational {
+        Some(config) => {
+            let reader = relational_reader::read(&tensors, adapter.source(), config.members, file)?;
+            adapter
+                .with_relational(reader)
+                .map_err(|error| damaged(error.into()))?
+        }
+        None => adapter,
+    };
 
     let room_fit = match body.fitted_to {
         Some(entry) => Some(room_fit::read(entry, &tensors, file)?),
@@ -147,37 +158,6 @@ pub(super) fn assembled(
         adapter: Arc::new(adapter),
         record,
     })
-}
-
-/// Errors of reading weights from a file.
-pub(super) enum WeightError {
-    File(Error),
-    Shape(adapter::Error),
-}
-
-impl From<adapter::Error> for WeightError {
-    fn from(error: adapter::Error) -> Self {
-        Self::Shape(error)
-    }
-}
-
-impl WeightError {
-    pub(super) fn within(self, file: &str) -> Error {
-        match self {
-            Self::File(error) => error,
-            Self::Shape(error) => Error::Damaged {
-                file: file.to_owned(),
-                problem: error.into(),
-            },
-        }
-    }
-}
-
-pub(super) fn read_weights(
-    tensors: &TensorReader<'_>,
-    name: &str,
-) -> Result<Array2<f32>, WeightError> {
-    tensors.f32(name).map_err(WeightError::File)
 }
 
 /// Reads the correctors listed in the manifest. They share the weights file; a prefix identifies
@@ -307,6 +287,10 @@ fn write_golden(
         &[twists.nrows(), 6],
         twists.iter().copied(),
     );
+
+    if let Some(reader) = adapter.relational() {
+        relational_reader::write(tensors, reader, golden.view())?;
+    }
 
     for corrector in adapter.correctors() {
         let steps = golden_steps(adapter, corrector.kind(), &latents)?;

@@ -6,8 +6,8 @@ use ndarray::Array2;
 use serde::Deserialize;
 
 use super::Error;
-use super::adapter_files::{read_weights, vector6};
-use super::tensors::TensorReader;
+use super::adapter_files::vector6;
+use super::tensors::{TensorReader, read_weights};
 use seese3_core::Cause;
 use seese3_core::adapter::{
     Adapter, Mixing, Mixture, PairPlan, TargetScale, TrainConfig, TrainingRecord,
@@ -134,6 +134,7 @@ pub fn read_foreign_adapter(description: &[u8], weights: &[u8]) -> Result<Foreig
             room_tests: Vec::new(),
             train: unknown,
             train_mean_r2: f64::NAN,
+            relational: None,
         },
         features,
     })

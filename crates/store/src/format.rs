@@ -6,7 +6,7 @@ use super::manifest::ObjectRef;
 use super::room_keypoints::KeypointsEntry;
 use super::stored_adapter::RoomFit;
 use seese3_core::adapter::{
-    Adapter, Corrector, CorrectorKind, PairPlan, TrainConfig, TrainingRecord,
+    Adapter, Corrector, CorrectorKind, PairPlan, RelationalConfig, TrainConfig, TrainingRecord,
 };
 use seese3_core::features::FeatureSource;
 use seese3_core::motion_scores::MotionScores;
@@ -138,6 +138,9 @@ pub struct TrainingEntry {
     room_tests: Vec<MotionScores>,
     /// Null if the targets do not vary.
     train_mean_r2: Option<f64>,
+    /// Settings of the relational reader; absent without one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    relational: Option<RelationalConfig>,
 }
 
 impl From<&RoomFit> for FittedEntry {
@@ -170,6 +173,7 @@ impl TrainingEntry {
             room_tests,
             train,
             train_mean_r2,
+            relational,
         } = record.clone();
 
         Self {
@@ -194,6 +198,7 @@ impl TrainingEntry {
             train,
             room_tests,
             train_mean_r2: train_mean_r2.is_finite().then_some(train_mean_r2),
+            relational,
         }
     }
 }
@@ -214,6 +219,7 @@ impl From<TrainingEntry> for TrainingRecord {
             train,
             room_tests,
             train_mean_r2,
+            relational,
         } = entry;
 
         Self {
@@ -232,6 +238,7 @@ impl From<TrainingEntry> for TrainingRecord {
             train,
             room_tests,
             train_mean_r2: train_mean_r2.unwrap_or(f64::NAN),
+            relational,
         }
     }
 }

@@ -44,6 +44,7 @@ mod tensors;
 mod room_keypoints;
 mod defaults;
 mod error_model;
+mod relational_reader;
 mod format;
 mod room_files;
 mod verification;
@@ -156,6 +157,12 @@ pub enum Error {
         room: String,
         name: String,
         known: Vec<String>,
+    },
+    #[error("room '{room}': {problem}")]
+    Join {
+        room: String,
+        #[source]
+        problem: seese3_core::features::Error,
     },
     #[error("room '{room}' has {}; name one", several(known))]
     WhichFeatures { room: String, known: Vec<String> },

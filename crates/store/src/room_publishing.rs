@@ -519,9 +519,9 @@ impl Store {
             return Ok((room.clone(), None));
         }
 
-        // No feature set has an empty name, so this loads the room without features.
+        // An empty list loads the room without features.
         let known = self
-            .load(room.id().as_str(), Some(newest), Some(""))
+            .load(room.id().as_str(), Some(newest), Some(&[]))
             .await?
             .room;
 

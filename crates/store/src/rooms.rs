@@ -10,7 +10,7 @@ use super::{Defaults, Error, Kind, Store, folder_of, revision_path};
 use seese3_core::Cause;
 use seese3_core::adapter::TrainingRecord;
 use seese3_core::eval::TrainedOn;
-use seese3_core::features::{FeatureSource, Features};
+use seese3_core::features::{FeatureSource, Features, JOINED};
 use seese3_core::keypoints::KeypointSource;
 use seese3_core::recording_extent::RecordingExtent;
 use seese3_core::room::{Provenance, Room, RoomId};
@@ -75,8 +75,8 @@ impl Store {
     }
 
     /// Loads the current revision of a room with one feature set: the named one, or the only one if
-    /// `features` is `None`. The features are returned separately; the returned room's list is
-    /// empty.
+    /// `features` is `None`. Several names, separated by `+` or `,`, are joined column by column in
+    /// this order. The features are returned separately; the returned room's list is empty.
     ///
     /// # Errors
     /// As [`Store::load_room`]; also [`Error::UnknownFeatures`] if the room has no features of this
@@ -102,10 +102,9 @@ impl Store {
         };
 
         // Without a name, the choice must be unambiguous.
-        let wanted = match (features, known.as_slice()) {
-            (Some(wanted), _) if known.iter().any(|name| name == wanted) => wanted.to_owned(),
-            (Some(wanted), _) => return Err(unknown(wanted)),
-            (None, [only]) => only.clone(),
+        let wanted: Vec<&str> = match (features, known.as_slice()) {
+            (Some(wanted), _) => wanted.split([JOINED, ',']).collect(),
+            (None, [only]) => vec![only.as_str()],
             (None, _) => {
                 return Err(Error::WhichFeatures {
                     room: name.to_owned(),
@@ -113,12 +112,29 @@ impl Store {
                 });
             }
         };
+        if let Some(missing) = wanted.iter().find(|name| !known.iter().any(|k| k == *name)) {
+            return Err(unknown(missing));
+        }
 
         // Load the revision whose features were listed above; a newer one may exist by now.
         let mut stored = self.load(name, Some(revision), Some(&wanted)).await?;
-        let features = stored.features.pop().ok_or_else(|| unknown(&wanted))?;
+        let sets = std::mem::take(&mut stored.features);
+        let mut parts = Vec::with_capacity(wanted.len());
+        for name in wanted {
+            let set = sets.iter().find(|set| set.source().name == name);
+            parts.push(set.ok_or_else(|| unknown(name))?);
+        }
 
-        Ok((stored, features))
+        match parts.as_slice() {
+            [only] => Ok((stored, (*only).clone())),
+            parts => {
+                let features = Features::joined(parts).map_err(|problem| Error::Join {
+                    room: name.to_owned(),
+                    problem,
+                })?;
+                Ok((stored, features))
+            }
+        }
     }
 
     /// Whether an adapter was trained on a revision of a room. Frames are compared, not revision
@@ -222,7 +238,7 @@ impl Store {
         &self,
         name: &str,
         revision: Option<u64>,
-        only: Option<&str>,
+        only: Option<&[&str]>,
     ) -> Result<StoredRoom, Error> {
         let (folder, revision) = self.resolve(Kind::Room, name, revision).await?;
         let body = self.room_body(&folder, revision).await?;
@@ -243,11 +259,11 @@ impl Store {
         let room = Room::new(id, frames, body.provenance).map_err(|error| damaged(error.into()))?;
         let mut features = Vec::new();
 
-        // `only` selects one feature set by name; without it, all are loaded.
+        // `only` selects feature sets by name; without it, all are loaded.
         for entry in body
             .features
             .into_iter()
-            .filter(|entry| only.is_none_or(|name| name == entry.source.name))
+            .filter(|entry| only.is_none_or(|names| names.contains(&entry.source.name.as_str())))
         {
             let (file, bytes) = self.read_object(&folder, &entry.object).await?;
             let rows = read_features(&file, &bytes)?;

@@ -190,3 +190,31 @@ impl<'a> TensorReader<'a> {
             .map_err(|error| damaged(error.into()))
     }
 }
+
+/// Errors of reading weights from a file.
+pub enum WeightError {
+    File(Error),
+    Shape(seese3_core::adapter::Error),
+}
+
+impl From<seese3_core::adapter::Error> for WeightError {
+    fn from(error: seese3_core::adapter::Error) -> Self {
+        Self::Shape(error)
+    }
+}
+
+impl WeightError {
+    pub fn within(self, file: &str) -> Error {
+        match self {
+            Self::File(error) => error,
+            Self::Shape(error) => Error::Damaged {
+                file: file.to_owned(),
+                problem: error.into(),
+            },
+        }
+    }
+}
+
+pub fn read_weights(tensors: &TensorReader<'_>, name: &str) -> Result<Array2<f32>, WeightError> {
+    tensors.f32(name).map_err(WeightError::File)
+}

@@ -11,6 +11,7 @@
 pub mod keypoint_map;
 pub mod keypoint_scene;
 pub mod oracle_room;
+pub mod panorama;
 pub mod recording;
 #[cfg(feature = "world")]
 pub mod world;

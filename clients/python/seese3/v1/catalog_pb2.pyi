@@ -249,7 +249,7 @@ class ExpectedError(_message.Message):
     def __init__(self, feature_distance: _Optional[float] = ..., translation_m: _Optional[float] = ..., rotation_rad: _Optional[float] = ...) -> None: ...
 
 class FeatureSource(_message.Message):
-    __slots__ = ("name", "encoder", "layer", "pooling", "preprocess", "dim", "layer_index_base", "final_norm")
+    __slots__ = ("name", "encoder", "layer", "pooling", "preprocess", "dim", "layer_index_base", "final_norm", "parts")
     NAME_FIELD_NUMBER: _ClassVar[int]
     ENCODER_FIELD_NUMBER: _ClassVar[int]
     LAYER_FIELD_NUMBER: _ClassVar[int]
@@ -258,6 +258,7 @@ class FeatureSource(_message.Message):
     DIM_FIELD_NUMBER: _ClassVar[int]
     LAYER_INDEX_BASE_FIELD_NUMBER: _ClassVar[int]
     FINAL_NORM_FIELD_NUMBER: _ClassVar[int]
+    PARTS_FIELD_NUMBER: _ClassVar[int]
     name: str
     encoder: str
     layer: str
@@ -266,7 +267,8 @@ class FeatureSource(_message.Message):
     dim: int
     layer_index_base: LayerIndexBase
     final_norm: FinalNorm
-    def __init__(self, name: _Optional[str] = ..., encoder: _Optional[str] = ..., layer: _Optional[str] = ..., pooling: _Optional[str] = ..., preprocess: _Optional[str] = ..., dim: _Optional[int] = ..., layer_index_base: _Optional[_Union[LayerIndexBase, str]] = ..., final_norm: _Optional[_Union[FinalNorm, str]] = ...) -> None: ...
+    parts: _containers.RepeatedCompositeFieldContainer[FeatureSource]
+    def __init__(self, name: _Optional[str] = ..., encoder: _Optional[str] = ..., layer: _Optional[str] = ..., pooling: _Optional[str] = ..., preprocess: _Optional[str] = ..., dim: _Optional[int] = ..., layer_index_base: _Optional[_Union[LayerIndexBase, str]] = ..., final_norm: _Optional[_Union[FinalNorm, str]] = ..., parts: _Optional[_Iterable[_Union[FeatureSource, _Mapping]]] = ...) -> None: ...
 
 class ListAdaptersRequest(_message.Message):
     __slots__ = ("page_size", "page_token")

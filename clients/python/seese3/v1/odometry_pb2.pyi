@@ -14,6 +14,7 @@ class MotionEstimator(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     MOTION_ESTIMATOR_ADAPTER: _ClassVar[MotionEstimator]
     MOTION_ESTIMATOR_TWO_VIEW: _ClassVar[MotionEstimator]
     MOTION_ESTIMATOR_NONE: _ClassVar[MotionEstimator]
+    MOTION_ESTIMATOR_RELATIONAL: _ClassVar[MotionEstimator]
 
 class Fusion(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -59,6 +60,7 @@ MOTION_ESTIMATOR_UNSPECIFIED: MotionEstimator
 MOTION_ESTIMATOR_ADAPTER: MotionEstimator
 MOTION_ESTIMATOR_TWO_VIEW: MotionEstimator
 MOTION_ESTIMATOR_NONE: MotionEstimator
+MOTION_ESTIMATOR_RELATIONAL: MotionEstimator
 FUSION_UNSPECIFIED: Fusion
 FUSION_ANCHORS: Fusion
 FUSION_NONE: Fusion
@@ -87,7 +89,7 @@ TRACK_REFUSAL_REASON_GRAVITY: TrackRefusalReason
 TRACK_REFUSAL_REASON_INERTIAL: TrackRefusalReason
 
 class EstimateMotionRequest(_message.Message):
-    __slots__ = ("room", "room_revision", "adapter", "adapter_revision", "first", "second", "camera")
+    __slots__ = ("room", "room_revision", "adapter", "adapter_revision", "first", "second", "camera", "estimator")
     ROOM_FIELD_NUMBER: _ClassVar[int]
     ROOM_REVISION_FIELD_NUMBER: _ClassVar[int]
     ADAPTER_FIELD_NUMBER: _ClassVar[int]
@@ -95,6 +97,7 @@ class EstimateMotionRequest(_message.Message):
     FIRST_FIELD_NUMBER: _ClassVar[int]
     SECOND_FIELD_NUMBER: _ClassVar[int]
     CAMERA_FIELD_NUMBER: _ClassVar[int]
+    ESTIMATOR_FIELD_NUMBER: _ClassVar[int]
     room: str
     room_revision: int
     adapter: str
@@ -102,7 +105,8 @@ class EstimateMotionRequest(_message.Message):
     first: _geometry_pb2.View
     second: _geometry_pb2.View
     camera: _geometry_pb2.ViewCamera
-    def __init__(self, room: _Optional[str] = ..., room_revision: _Optional[int] = ..., adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ..., first: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ..., second: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ..., camera: _Optional[_Union[_geometry_pb2.ViewCamera, _Mapping]] = ...) -> None: ...
+    estimator: MotionEstimator
+    def __init__(self, room: _Optional[str] = ..., room_revision: _Optional[int] = ..., adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ..., first: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ..., second: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ..., camera: _Optional[_Union[_geometry_pb2.ViewCamera, _Mapping]] = ..., estimator: _Optional[_Union[MotionEstimator, str]] = ...) -> None: ...
 
 class EncodeRequest(_message.Message):
     __slots__ = ("room", "room_revision", "adapter", "adapter_revision", "views", "with_features")

@@ -20,6 +20,7 @@ mod phi;
 mod preset;
 mod real;
 mod record;
+mod relational;
 mod samples;
 mod seeded;
 mod siamese;
@@ -37,6 +38,10 @@ pub use phi::{Phi, Widths};
 pub use preset::{PairPlan, Preset};
 pub use real::Real;
 pub use record::TrainingRecord;
+pub use relational::{
+    CellLayout, Cells, MAX_MEMBERS, MotionReading, PAIRS_PER_EPOCH, PairSampler, RelationalConfig,
+    RelationalNetwork, RelationalReader, RelationalSamples, RoomFrames, train_relational,
+};
 pub use samples::{Samples, column_scale};
 pub use siamese::{Siamese, TENSOR_NAMES};
 pub use train::{EpochProgress, StepReport, TrainConfig, Trainer, train, train_further};
@@ -92,6 +97,15 @@ pub enum Error {
     Gate { chart: usize, value: f64 },
     #[error("an adapter has 1 to {MAX_CHARTS} charts, not {count}")]
     Charts { count: usize },
+    #[error(
+        "features '{name}' are pooled by '{pooling}'; a relational reader compares cells, so it needs \
+         features of a grid of four or more cells (encode --pool grid4x4)"
+    )]
+    NotAGrid { name: String, pooling: String },
+    #[error("a relational reader has 1 to {MAX_MEMBERS} members, not {count}")]
+    Members { count: usize },
+    #[error("the adapter has no relational reader (train --reader relational)")]
+    NoRelational,
     #[error("the adapter has no corrector '{name}' (train --correctors); it has {known}")]
     NoCorrector { name: &'static str, known: String },
     #[error(

@@ -1,6 +1,6 @@
 //! The training record, stored with an adapter so that the run can be reproduced.
 
-use super::{Mixing, PairPlan, TrainConfig};
+use super::{Mixing, PairPlan, RelationalConfig, TrainConfig};
 use crate::motion_scores::MotionScores;
 use crate::room::RoomId;
 use crate::splits::Split;
@@ -34,6 +34,8 @@ pub struct TrainingRecord {
     /// Baseline: R² on the test pairs if μ is predicted for every pair; mean over rooms. A fitted
     /// adapter has no test pairs; there the training pairs are used.
     pub train_mean_r2: f64,
+    /// Settings of the relational reader, if the adapter has one.
+    pub relational: Option<RelationalConfig>,
 }
 
 impl TrainingRecord {

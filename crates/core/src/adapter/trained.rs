@@ -8,7 +8,7 @@ use ndarray::{Array1, Array2, ArrayView1, ArrayView2, Axis, s};
 use super::inverse::{pseudo_inverse, target};
 use super::{
     Corrector, CorrectorKind, Error, ErrorModel, Inverse, MAX_LATENT, Mixing, Mixture, Network,
-    Reading, TargetScale,
+    Reading, RelationalReader, TargetScale,
 };
 use crate::features::FeatureSource;
 use crate::geometry::Twist;
@@ -29,6 +29,7 @@ pub struct Adapter {
     correctors: Vec<(Corrector<f32>, Corrector<f64>)>,
     error_covariance: Option<Matrix6<f64>>,
     error_model: Option<Arc<ErrorModel>>,
+    relational: Option<Arc<RelationalReader>>,
 }
 
 impl Adapter {
@@ -95,6 +96,7 @@ impl Adapter {
             correctors: Vec::new(),
             error_covariance: None,
             error_model: None,
+            relational: None,
         })
     }
 
@@ -158,6 +160,27 @@ impl Adapter {
     /// The error model, if the adapter has one.
     pub fn error_model(&self) -> Option<&Arc<ErrorModel>> {
         self.error_model.as_ref()
+    }
+
+    /// The same adapter with a relational reader of the same features.
+    ///
+    /// # Errors
+    /// [`Error::FeatureDim`] if the reader is for features of another width.
+    pub fn with_relational(mut self, reader: RelationalReader) -> Result<Self, Error> {
+        if reader.feature_dim() != self.source.dim {
+            return Err(Error::FeatureDim {
+                expected: self.source.dim,
+                actual: reader.feature_dim(),
+            });
+        }
+
+        self.relational = Some(Arc::new(reader));
+        Ok(self)
+    }
+
+    /// The relational reader, if the adapter has one.
+    pub fn relational(&self) -> Option<&Arc<RelationalReader>> {
+        self.relational.as_ref()
     }
 
     /// The source of the features that the adapter was trained on.
@@ -471,6 +494,7 @@ fn describe(source: &FeatureSource) -> String {
         pooling,
         preprocess,
         dim,
+        parts: _,
     } = source;
 
     format!(

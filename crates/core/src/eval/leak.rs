@@ -68,7 +68,7 @@ impl Report {
                 Some(NavigatorKind::Step(_, RetrievalMetric::Calibrated)) => {
                     leak.is_some() || is_calibrated_here
                 }
-                Some(NavigatorKind::Step(..)) | None => leak.is_some(),
+                Some(NavigatorKind::Step(..) | NavigatorKind::Relational) | None => leak.is_some(),
             };
         }
         self

@@ -11,8 +11,8 @@ use crate::cancel::Cancellation;
 use crate::geometry::{Pose, body_twist};
 use crate::index::Exclusion;
 use crate::navigation::{
-    self, Leg, Mode, Navigator, NavigatorKind, Plan, RefitData, RetrievalMetric, Search, Space,
-    Start, StepKind, Stepper, walk,
+    self, Leg, Mode, Navigator, NavigatorKind, Plan, RefitData, RelationalView, RelationalWalk,
+    RetrievalMetric, Search, Space, Start, StepKind, Stepper, relational_walk, walk,
 };
 use crate::room::{FrameId, Timeline};
 use crate::splits::{Pair, Split};
@@ -156,6 +156,7 @@ pub fn evaluate(
     let navigators = protocol.rows(navigator)?;
 
     let inputs = TableInputs {
+        navigator,
         poses: navigator.room().poses(),
         adapter: navigator.adapter(),
         latents: navigator.latents(),
@@ -193,6 +194,7 @@ pub fn evaluate(
 
 /// Common inputs of all rows of the table.
 struct TableInputs<'a> {
+    navigator: &'a Navigator,
     poses: &'a [Pose],
     adapter: &'a Adapter,
     latents: ArrayView2<'a, f64>,
@@ -209,6 +211,7 @@ impl TableInputs<'_> {
             NavigatorKind::Identity => self.identity(),
             NavigatorKind::Random => Ok(self.row_of_frames(kind, &self.random_frames()?)),
             NavigatorKind::Oracle => Ok(self.row_of_frames(kind, &self.nearest_poses()?)),
+            NavigatorKind::Relational => self.relational(),
             NavigatorKind::Step(step, metric) => {
                 // A refit is fitted once, for all pairs.
                 let ground = RefitData {
@@ -248,14 +251,67 @@ impl TableInputs<'_> {
         }
     }
 
-    fn walked(&self, space: Space<'_>, pair: Pair) -> Result<Vec<navigation::Step>, Error> {
-        let Protocol {
-            steps,
-            mode,
-            exclude_source,
-            ..
-        } = *self.protocol;
+    /// The relational reader predicts no latent, so the row has only scores of frames.
+    fn relational(&self) -> Result<Row, Error> {
+        let search = Search::exact(
+            RetrievalMetric::Full,
+            self.adapter,
+            self.latents,
+            &self.candidates,
+        )?;
+        let space = self.navigator.relational_space(&search)?;
 
+        let mut retrieved = Vec::with_capacity(self.test.len());
+        for &pair in &self.test {
+            let [source, target] = [pair.source, pair.target].map(|frame| self.poses[frame.row()]);
+            let latent = self.latents.row(pair.source.row()).to_owned();
+            let walk = RelationalWalk {
+                space,
+                latents: self.latents,
+                poses: self.poses,
+                start: RelationalView {
+                    cells: space.cells,
+                    image: pair.source.row(),
+                    latent: &latent,
+                },
+                start_frame: Some(pair.source),
+                start_pose: Some(source),
+                leg: body_twist(&source, &target),
+                goal: Some(target),
+                source_from_leg: Pose::identity(),
+                plan: self.plan(),
+            };
+
+            // Only the last step of a walk is scored.
+            let walked = relational_walk(&walk, self.cancel);
+            let steps = walked.map_err(|error| of_pair(error, pair))?;
+            retrieved.extend(steps.last().map(|neighbors| neighbors[0].frame));
+        }
+
+        Ok(Row {
+            name: NavigatorKind::Relational.name(),
+            n: self.test.len(),
+            latent: None,
+            retrieval: RetrievalScores::of(
+                &self.test,
+                &retrieved,
+                self.poses,
+                &self.protocol.thresholds,
+            ),
+            leaks: false,
+        })
+    }
+
+    fn plan(&self) -> Plan {
+        Plan {
+            mode: self.protocol.mode,
+            steps: self.protocol.steps,
+            top_k: 1,
+            exclude_source: self.protocol.exclude_source,
+        }
+    }
+
+    fn walked(&self, space: Space<'_>, pair: Pair) -> Result<Vec<navigation::Step>, Error> {
         let [source, target] = [pair.source, pair.target].map(|frame| self.poses[frame.row()]);
         let latent = self.latents.row(pair.source.row()).to_owned();
         let start = Start {
@@ -270,20 +326,8 @@ impl TableInputs<'_> {
             goal: Some(target),
         };
 
-        let plan = Plan {
-            mode,
-            steps,
-            top_k: 1,
-            exclude_source,
-        };
-
-        // Report the pair for which no candidate was left.
-        walk(space, &start, leg, plan, self.cancel).map_err(|error| match error {
-            navigation::Error::NoCandidates { .. } => Error::NoCandidates {
-                source_frame: pair.source,
-            },
-            other => other.into(),
-        })
+        let walked = walk(space, &start, leg, self.plan(), self.cancel);
+        walked.map_err(|error| of_pair(error, pair))
     }
 
     fn identity(&self) -> Result<Row, Error> {
@@ -406,5 +450,15 @@ impl TableInputs<'_> {
             .latents
             .slice(s![.., ..self.adapter.coordinate_count()]);
         coordinates.select(Axis(0), &frames.map(FrameId::row).collect::<Vec<_>>())
+    }
+}
+
+/// Names the pair for which no candidate was left.
+fn of_pair(error: navigation::Error, pair: Pair) -> Error {
+    match error {
+        navigation::Error::NoCandidates { .. } => Error::NoCandidates {
+            source_frame: pair.source,
+        },
+        other => other.into(),
     }
 }

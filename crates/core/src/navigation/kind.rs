@@ -18,6 +18,9 @@ pub enum NavigatorKind {
     Oracle,
     /// Predicts the latent after a motion and retrieves the nearest frame under a metric.
     Step(StepKind, RetrievalMetric),
+    /// Retrieves the frame to which the motion is most likely under the adapter's relational
+    /// reader. Ours, not the paper's.
+    Relational,
 }
 
 /// Separator between step and metric in a navigator's name.
@@ -39,12 +42,13 @@ impl NavigatorKind {
         [Self::Identity, Self::Random, Self::Oracle]
             .into_iter()
             .chain(steps)
+            .chain([Self::Relational])
             .collect()
     }
 
     /// Default rows of the table for an adapter: baselines, the three readings of inverse Poincaré,
     /// the adapter's correctors, refits on z-scored and on unscaled motions, and inverse Poincaré
-    /// under the other supported metrics.
+    /// under the other supported metrics, and the relational reader if the adapter has one.
     pub fn table(adapter: &Adapter) -> Vec<Self> {
         let full = |step: StepKind| Self::Step(step, RetrievalMetric::Full);
         let corrector = |kind: CorrectorKind| full(StepKind::Corrector(kind));
@@ -88,6 +92,7 @@ impl NavigatorKind {
         let homogeneous = StepKind::InversePoincare(Reading::Homogeneous);
         let calibrated = adapter.error_covariance().filter(|_| !gated);
         rows.extend(calibrated.map(|_| Self::Step(homogeneous, RetrievalMetric::Calibrated)));
+        rows.extend(adapter.relational().map(|_| Self::Relational));
 
         rows
     }
@@ -99,6 +104,7 @@ impl NavigatorKind {
             Self::Identity => "identity".to_owned(),
             Self::Random => "random".to_owned(),
             Self::Oracle => "oracle".to_owned(),
+            Self::Relational => "relational".to_owned(),
             Self::Step(step, RetrievalMetric::Full) => step.name(),
             Self::Step(step, metric) => format!("{}{UNDER}{metric}", step.name()),
         }
@@ -113,7 +119,7 @@ impl NavigatorKind {
     pub fn known_names() -> String {
         let steps: Vec<String> = StepKind::all().into_iter().map(StepKind::name).collect();
         format!(
-            "identity, random, oracle, {}; ways to step also with +row-space, +whitened or +motion, and \
+            "identity, random, oracle, relational, {}; ways to step also with +row-space, +whitened or +motion, and \
              inverse-poincare-homogeneous with +calibrated",
             steps.join(", ")
         )

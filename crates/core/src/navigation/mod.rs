@@ -14,6 +14,7 @@ mod multi_step;
 mod navigator;
 mod pursuit;
 mod query;
+mod relational;
 mod search;
 mod stepper;
 
@@ -22,7 +23,8 @@ pub use kind::NavigatorKind;
 pub use multi_step::{Leg, Mode, Plan, Space, Start, Step, walk};
 pub use navigator::{Answer, AnswerStep, Navigator, RetrievedFrame, StepError};
 pub use pursuit::{Feedback, Outcome, Pursuit, pursue};
-pub use query::{FitOn, Limits, Query, RequestedMotion, Source, SourceAt};
+pub use query::{FitOn, Limits, Method, Query, RequestedMotion, Source, SourceAt};
+pub use relational::{RelationalSpace, RelationalView, RelationalWalk, SHORTLIST, relational_walk};
 pub use search::{IndexKind, RetrievalMetric, Search};
 pub use stepper::{Refit, RefitData, StepKind, Stepper};
 
@@ -83,6 +85,11 @@ pub enum Error {
         "{what} needs a source with a known pose: use a frame of the room, or give source_pose"
     )]
     PoseNeeded { what: &'static str },
+    #[error(
+        "the navigator 'relational' compares images, which a latent no longer has; use a frame, a \
+         feature or an image as the source"
+    )]
+    ViewNeeded,
     #[error("no frame is left to retrieve: all {frame_count} frames are excluded")]
     NoCandidates { frame_count: usize },
 }

@@ -2,19 +2,20 @@
 
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
-use ndarray::{Array1, Array2, ArrayView1, ArrayView2};
+use ndarray::{Array1, Array2, ArrayView1, ArrayView2, Axis};
 use strum::VariantArray;
 
 use super::{
-    Error, FitOn, IndexKind, Leg, Limits, Plan, Query, Refit, RefitData, RequestedMotion,
-    RetrievalMetric, Search, Source, Space, Start, StepKind, Stepper, check_twist, walk,
+    Error, FitOn, IndexKind, Leg, Limits, Method, Mode, Plan, Query, Refit, RefitData,
+    RelationalSpace, RelationalView, RelationalWalk, RequestedMotion, RetrievalMetric, Search,
+    Source, Space, Start, StepKind, Stepper, check_twist, relational_walk, walk,
 };
-use crate::adapter::Adapter;
+use crate::adapter::{self, Adapter, Cells};
 use crate::cancel::Cancellation;
 use crate::features::Features;
 use crate::geometry::{Pose, PoseError, Twist, body_twist, exp};
 use crate::index::{Audit, Neighbor};
-use crate::room::Room;
+use crate::room::{FrameId, Room};
 use crate::splits::Pair;
 
 /// Maximum number of cached refits; the oldest is dropped first.
@@ -32,9 +33,9 @@ pub struct RetrievedFrame {
 /// One step of an answer.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AnswerStep {
-    /// ĝ, the predicted latent.
-    pub latent: Array1<f64>,
-    /// The frames nearest to ĝ; at least one.
+    /// ĝ, the predicted latent; `None` for a method that predicts none.
+    pub latent: Option<Array1<f64>>,
+    /// The retrieved frames, the nearest first; at least one.
     pub frames: Vec<RetrievedFrame>,
     /// The requested pose after the step, `world_from_camera`, if the source's pose is known.
     pub requested_pose: Option<Pose>,
@@ -80,6 +81,8 @@ pub struct Navigator {
     room: Arc<Room>,
     adapter: Arc<Adapter>,
     latents: Array2<f64>,
+    /// Cells of all frames, if the adapter has a relational reader.
+    cells: Option<Cells>,
     kind: IndexKind,
     /// The search under [`RetrievalMetric::Full`].
     search: Search,
@@ -116,11 +119,16 @@ impl Navigator {
 
         let latents = adapter.embed(features.rows())?;
         let search = Search::new(kind, RetrievalMetric::Full, &adapter, latents.view())?;
+        let cells = match adapter.relational() {
+            Some(reader) => Some(reader.cells(features.rows())?),
+            None => None,
+        };
 
         Ok(Self {
             room,
             adapter,
             latents,
+            cells,
             kind,
             search,
             other_searches: Default::default(),
@@ -147,7 +155,32 @@ impl Navigator {
     /// Approximate memory use, bytes, without the room, the adapter and the caches (searches under
     /// other metrics, refits).
     pub fn memory_bytes(&self) -> usize {
-        self.latents.len() * size_of::<f64>() + self.search.memory_bytes()
+        let cells = self.cells.as_ref().map_or(0, Cells::memory_bytes);
+        self.latents.len() * size_of::<f64>() + self.search.memory_bytes() + cells
+    }
+
+    /// The room's views for relational navigation, with `search` over the candidate frames.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] when the adapter has no relational reader.
+    pub fn relational_space<'a>(
+        &'a self,
+        search: &'a Search,
+    ) -> Result<RelationalSpace<'a>, Error> {
+        let reader = self.adapter.relational().zip(self.cells.as_ref());
+        let (reader, cells) = reader.ok_or(adapter::Error::NoRelational)?;
+
+        Ok(RelationalSpace {
+            adapter: &self.adapter,
+            reader,
+            cells,
+            search,
+        })
+    }
+
+    /// Cells of all frames, if the adapter has a relational reader.
+    pub fn cells(&self) -> Option<&Cells> {
+        self.cells.as_ref()
     }
 
     /// Recall of an approximate index against the exact scan; `None` if the index is exact.
@@ -278,19 +311,18 @@ impl Navigator {
         query.check(limits)?;
         let start = self.start(&query.source.source, query.source.pose)?;
         let twists = self.twists(&query.motion, &start)?;
-        let stepper = self.stepper(query.step, query.fit_on)?;
+        let (step, metric) = match query.method {
+            Method::Latent(step, metric) => (step, metric),
+            Method::Relational => return self.relational_answer(query, &start, &twists, cancel),
+        };
+        let stepper = self.stepper(step, query.fit_on)?;
         let space = Space {
             stepper: &stepper,
-            search: self.search(query.metric)?,
+            search: self.search(metric)?,
             ..self.space(&stepper)
         };
 
-        let plan = Plan {
-            mode: query.mode,
-            steps: query.steps,
-            top_k: query.top_k as usize,
-            exclude_source: query.exclude_source,
-        };
+        let plan = plan_of(query);
 
         let mut steps = Vec::new();
         let mut from = start.clone();
@@ -315,19 +347,91 @@ impl Navigator {
                 from = query
                     .mode
                     .next_start(&from, &step.latent, step.neighbors[0].frame, space);
-                steps.push(self.answer_step(step, start.pose, wanted));
+                steps.push(AnswerStep {
+                    latent: Some(step.latent),
+                    ..self.answer_step(&step.neighbors, start.pose, wanted)
+                });
             }
         }
 
-        // All motions as one twist, from the source to the last requested pose.
-        let motion = start
-            .pose
-            .zip(wanted)
-            .map(|(from, to)| body_twist(&from, &to));
+        Ok(Answer {
+            steps,
+            motion: whole_motion(start.pose, wanted),
+        })
+    }
+
+    /// Answers a query with the relational reader.
+    fn relational_answer(
+        &self,
+        query: &Query,
+        start: &Start,
+        twists: &[Twist],
+        cancel: &Cancellation,
+    ) -> Result<Answer, Error> {
+        let space = self.relational_space(&self.search)?;
+
+        // A frame's cells are in the room; those of a feature are computed.
+        let given = match &query.source.source {
+            Source::Frame(_) => None,
+            Source::Feature(feature) => {
+                let row = ArrayView1::from(feature.as_slice()).insert_axis(Axis(0));
+                Some(space.reader.cells(row)?)
+            }
+            Source::Latent(_) => return Err(Error::ViewNeeded),
+        };
+        let source = RelationalView {
+            cells: given.as_ref().unwrap_or(space.cells),
+            image: start.frame.map_or(0, FrameId::row),
+            latent: &start.latent,
+        };
+
+        let mut steps: Vec<AnswerStep> = Vec::new();
+        let mut wanted = start.pose;
+        let mut source_from_leg = Pose::identity();
+        for &twist in twists {
+            let previous_goal = wanted;
+
+            // An open loop compares every step with the source; the other modes continue from the
+            // frame that the last leg retrieved.
+            let arrived = steps.last().map(|step| step.frames[0].neighbor.frame);
+            let at = arrived.filter(|_| query.mode != Mode::OpenLoop);
+            let latent = at.map(|frame| self.latents.row(frame.row()).to_owned());
+            let view = match (at, &latent) {
+                (Some(frame), Some(latent)) => RelationalView {
+                    cells: space.cells,
+                    image: frame.row(),
+                    latent,
+                },
+                _ => source,
+            };
+
+            let walked = relational_walk(
+                &RelationalWalk {
+                    space,
+                    latents: self.latents.view(),
+                    poses: self.room.poses(),
+                    start: view,
+                    start_frame: at.or(start.frame),
+                    start_pose: at.map_or(start.pose, |f| Some(self.room.poses()[f.row()])),
+                    leg: twist,
+                    goal: previous_goal.map(|pose| pose * exp(&twist)),
+                    source_from_leg,
+                    plan: plan_of(query),
+                },
+                cancel,
+            )?;
+
+            for (done, neighbors) in (1usize..).zip(walked) {
+                let walked_so_far = twist.times(done).divided(query.steps);
+                wanted = previous_goal.map(|pose| pose * exp(&walked_so_far));
+                steps.push(self.answer_step(&neighbors, start.pose, wanted));
+            }
+            source_from_leg *= exp(&twist);
+        }
 
         Ok(Answer {
             steps,
-            motion: motion.filter(|twist| twist.is_unique_logarithm()),
+            motion: whole_motion(start.pose, wanted),
         })
     }
 
@@ -360,17 +464,17 @@ impl Navigator {
 
     fn answer_step(
         &self,
-        step: super::Step,
+        neighbors: &[Neighbor],
         source: Option<Pose>,
         requested: Option<Pose>,
     ) -> AnswerStep {
-        let frames = self.retrieved(&step.neighbors);
+        let frames = self.retrieved(neighbors);
         let error = source
             .zip(requested)
             .map(|(source, requested)| StepError::of(&source, &frames[0].pose, &requested));
 
         AnswerStep {
-            latent: step.latent,
+            latent: None,
             frames,
             requested_pose: requested,
             error,
@@ -386,4 +490,20 @@ impl Navigator {
             })
             .collect()
     }
+}
+
+fn plan_of(query: &Query) -> Plan {
+    Plan {
+        mode: query.mode,
+        steps: query.steps,
+        top_k: query.top_k as usize,
+        exclude_source: query.exclude_source,
+    }
+}
+
+/// All motions as one twist, from the source to the last requested pose; `None` if a pose is
+/// unknown or the logarithm is not unique.
+fn whole_motion(source: Option<Pose>, wanted: Option<Pose>) -> Option<Twist> {
+    let motion = source.zip(wanted).map(|(from, to)| body_twist(&from, &to));
+    motion.filter(|twist| twist.is_unique_logarithm())
 }

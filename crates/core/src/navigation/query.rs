@@ -1,6 +1,6 @@
 //! Queries to a navigator, and their limits.
 
-use super::{Error, Mode, RetrievalMetric, StepKind, check_twist};
+use super::{Error, Mode, NavigatorKind, RetrievalMetric, StepKind, check_twist};
 use crate::geometry::{Pose, Twist};
 use crate::room::FrameId;
 use crate::splits::Split;
@@ -46,6 +46,25 @@ pub struct FitOn {
     pub stride: u32,
 }
 
+/// How frames are retrieved for a motion.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Method {
+    /// A step in latent space, and the nearest frames under a metric.
+    Latent(StepKind, RetrievalMetric),
+    /// The likelihood of the motion under the adapter's relational reader.
+    Relational,
+}
+
+impl Method {
+    /// The navigator of this method.
+    pub fn navigator(self) -> NavigatorKind {
+        match self {
+            Self::Latent(step, metric) => NavigatorKind::Step(step, metric),
+            Self::Relational => NavigatorKind::Relational,
+        }
+    }
+}
+
 /// A query to a navigator.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Query {
@@ -57,10 +76,8 @@ pub struct Query {
     pub steps: u32,
     /// How the steps are chained.
     pub mode: Mode,
-    /// The method that turns a motion into a latent step.
-    pub step: StepKind,
-    /// Distance for the retrieval of frames.
-    pub metric: RetrievalMetric,
+    /// How frames are retrieved for a motion.
+    pub method: Method,
     /// Pairs for fitting a refit.
     pub fit_on: FitOn,
     /// Frames retrieved for each step.

@@ -6,6 +6,8 @@ mod hold_out;
 
 pub use hold_out::{HoldOut, is_in_left_out_block};
 
+use std::ops::Range;
+
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use strum::{Display, EnumMessage, EnumString, IntoStaticStr, VariantArray};
@@ -129,6 +131,29 @@ impl Split {
     /// Whether a pair is a test pair, at any stride.
     pub fn tests(self, timeline: &Timeline, pair: Pair) -> bool {
         self.is_on(timeline, pair, Side::Test)
+    }
+
+    /// Uninterrupted runs of training frames, as ranges of rows: no test frame lies within a run,
+    /// and all its frames are in one sequence. Under [`Split::Pairs`] and [`Split::Whole`], which
+    /// hold out no frames, these are the sequences.
+    pub fn training_runs(self, timeline: &Timeline) -> Vec<Range<usize>> {
+        let mut runs: Vec<Range<usize>> = Vec::new();
+        for frame in frames(timeline.frame_count) {
+            if self.tests_frame(timeline, frame) {
+                continue;
+            }
+
+            match runs.last_mut() {
+                Some(run)
+                    if run.end == frame.row() && timeline.joins(FrameId(frame.0 - 1), frame) =>
+                {
+                    run.end += 1;
+                }
+                _ => runs.push(frame.row()..frame.row() + 1),
+            }
+        }
+
+        runs
     }
 
     /// Candidate frames for a test query: the test frames, or all frames under
@@ -299,6 +324,23 @@ fn frames(count: usize) -> impl Iterator<Item = FrameId> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Oracle: by hand. Of 100 frames, `time` trains on the first 80 and `fold2` tests 20 to 39; the
+    /// second sequence begins at frame 50.
+    #[test]
+    fn training_runs_end_at_test_frames_and_sequences() {
+        let timeline = Timeline {
+            sequences: (0..100).map(|row| u32::from(row >= 50)).collect(),
+            ..Timeline::unbroken(100)
+        };
+
+        assert_eq!(Split::Time.training_runs(&timeline), [0..50, 50..80]);
+        assert_eq!(
+            Split::Fold2.training_runs(&timeline),
+            [0..20, 40..50, 50..100]
+        );
+        assert_eq!(Split::Whole.training_runs(&timeline), [0..50, 50..100]);
+    }
 
     /// Oracle: the pair counts of the published PyTorch reference on 1,000 frames: its column n.
     #[test]

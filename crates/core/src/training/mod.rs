@@ -1,5 +1,9 @@
 //! Training: features and poses of rooms in, an adapter and its scores out.
 
+mod relational;
+
+pub use relational::{relational_predictions, train_reader};
+
 use ndarray::{Array2, ArrayView2, s};
 
 use crate::adapter::{
@@ -301,6 +305,7 @@ pub fn train_adapter(
         room_tests,
         train: train_scores(&adapter, &samples)?,
         train_mean_r2: mean_of_known(&train_mean_r2),
+        relational: None,
     };
 
     Ok((adapter, record))

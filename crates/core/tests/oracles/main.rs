@@ -12,5 +12,6 @@ mod correctors;
 mod geometry;
 mod index_contract;
 mod navigation;
+mod relational;
 mod scores;
 mod training;

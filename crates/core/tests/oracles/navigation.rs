@@ -149,6 +149,7 @@ fn evaluated(navigator: &Navigator, exclude_source: Option<u32>) -> Vec<Row> {
         match kind {
             NavigatorKind::Step(_, RetrievalMetric::Calibrated) => false,
             NavigatorKind::Step(StepKind::Corrector(_), _) => corrected,
+            NavigatorKind::Relational => false,
             _ => true,
         }
     };

@@ -11,14 +11,16 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Serialize, Serializer};
 
-use seese3_core::adapter::{Adapter, TrainingRecord};
+use seese3_core::adapter::{Adapter, RelationalConfig, TrainingRecord};
 use seese3_core::cancel::Cancellation;
 use seese3_core::eval::{Baselines, Protocol, Row, TestPairs, evaluate};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::navigation::{IndexKind, Navigator, NavigatorKind};
 use seese3_core::room::RoomId;
 use seese3_core::statistics::{Rate, RoomMean, bootstrap_mean};
-use seese3_core::training::{RoomData, TrainingPlan, motions, predictions, train_adapter};
+use seese3_core::training::{
+    RoomData, TrainingPlan, motions, predictions, train_adapter, train_reader,
+};
 use seese3_robot::calibration::{Calibrated, calibrate_retrieval};
 
 use super::Error;
@@ -117,6 +119,8 @@ impl CrossRoomRun {
 pub struct CrossRoomPlan<'a> {
     /// How the adapter is trained, with its seed.
     pub training: &'a TrainingPlan,
+    /// Settings of a relational reader to train beside it, if any.
+    pub relational: Option<RelationalConfig>,
     /// Number of rooms, taken from the end of the list, used for calibration instead of training.
     pub calibration_rooms: usize,
     /// How the held-out rooms are evaluated.
@@ -182,7 +186,15 @@ pub fn train_and_calibrate(
     progress: &CrossRoomProgress<'_>,
 ) -> Result<(Adapter, TrainingRecord), Error> {
     let (training, calibration) = parted(rooms, plan)?;
-    let (adapter, record) = train_adapter(training, plan.training, &mut |_| (progress.epoch)())?;
+    let (mut adapter, mut record) =
+        train_adapter(training, plan.training, &mut |_| (progress.epoch)())?;
+    if let Some(config) = &plan.relational {
+        let reader = train_reader(training, plan.training.split, config, &mut |_| {
+            (progress.epoch)()
+        })?;
+        adapter = adapter.with_relational(reader)?;
+        record.relational = Some(config.clone());
+    }
     if calibration.is_empty() {
         return Ok((adapter, record));
     }

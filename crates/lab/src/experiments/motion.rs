@@ -4,14 +4,14 @@
 use rayon::prelude::*;
 use serde::Serialize;
 
-use seese3_core::adapter::Adapter;
+use seese3_core::adapter::{Adapter, MotionReading};
 use seese3_core::features::Features;
 use seese3_core::geometry::{CameraIntrinsics, PoseError, Twist, exp, log};
 use seese3_core::keypoints::Keypoints;
 use seese3_core::nalgebra::Cholesky;
 use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::Pair;
-use seese3_core::statistics::{Coverage, coverage};
+use seese3_core::statistics::{Coverage, RecordedMedian, coverage, median_of_recording};
 use seese3_core::training::motions;
 use seese3_robot::matched_views::ViewKeypoints;
 use seese3_robot::two_view;
@@ -31,10 +31,27 @@ pub struct MotionEvaluation {
     pub without_mean: Option<LocalizationErrors>,
     /// The constant baseline, which always predicts μ.
     pub constant: Option<LocalizationErrors>,
+    /// Errors of the adapter's relational reader, if it has one.
+    pub relational: Option<RelationalErrors>,
     /// Errors of the two-view estimator, if keypoints were given.
     pub two_view: Option<TwoViewErrors>,
     /// Errors of the zero-motion baseline.
     pub no_motion: LocalizationErrors,
+    /// Absolute errors of the zero-motion baseline by component of (v, ω), meters and radians: the
+    /// sizes of the motions.
+    pub no_motion_components: [RecordedMedian; 6],
+}
+
+/// The errors of a relational reader.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct RelationalErrors {
+    /// Errors over all pairs.
+    #[serde(flatten)]
+    pub ours: LocalizationErrors,
+    /// Absolute errors by component of (v, ω), meters and radians.
+    pub components: [RecordedMedian; 6],
+    /// Coverage of its covariances; `None` if the reader is not calibrated.
+    pub coverage: Option<Coverage>,
 }
 
 /// The errors of a two-view estimator.
@@ -82,8 +99,13 @@ pub fn evaluate(
         ours,
         without_mean,
         constant,
+        relational: match adapter {
+            Some((adapter, features)) => by_reader(adapter, features, pairs, &truth)?,
+            None => None,
+        },
         two_view: views.map(|views| by_two_views(views, pairs, &truth, on_pair_read)),
         no_motion: errors(&truth, &vec![Twist::default(); truth.len()]),
+        no_motion_components: by_component(&truth, &vec![Twist::default(); truth.len()]),
     })
 }
 
@@ -114,6 +136,55 @@ fn by_adapter(
         }),
         read(&|_| mean),
     ])
+}
+
+/// Errors of the adapter's relational reader; `None` without one.
+fn by_reader(
+    adapter: &Adapter,
+    features: &Features,
+    pairs: &[Pair],
+    truth: &[Twist],
+) -> Result<Option<RelationalErrors>, Error> {
+    let Some(reader) = adapter.relational() else {
+        return Ok(None);
+    };
+
+    let cells = reader.cells(features.rows())?;
+    let readings: Vec<MotionReading> = pairs
+        .par_iter()
+        .map(|pair| {
+            let target = cells.select(&[pair.target.row()]);
+            reader.motions(&cells, pair.source.row(), &target)[0]
+        })
+        .collect();
+
+    let read: Vec<Twist> = readings.iter().map(|reading| reading.twist).collect();
+    let lengths: Vec<f64> = readings
+        .iter()
+        .zip(truth)
+        .filter_map(|(reading, truth)| {
+            let off = truth.to_vector() - reading.twist.to_vector();
+            Some(off.dot(&Cholesky::new(reading.covariance)?.solve(&off)))
+        })
+        .collect();
+
+    Ok(Some(RelationalErrors {
+        ours: errors(truth, &read),
+        components: by_component(truth, &read),
+        coverage: reader.error_scale().map(|_| coverage(&lengths)),
+    }))
+}
+
+/// Absolute errors of twists by component, with intervals over blocks of the recording.
+fn by_component(truth: &[Twist], read: &[Twist]) -> [RecordedMedian; 6] {
+    std::array::from_fn(|component| {
+        let errors: Vec<f64> = truth
+            .iter()
+            .zip(read)
+            .map(|(truth, read)| (truth.to_vector()[component] - read.to_vector()[component]).abs())
+            .collect();
+        median_of_recording(&errors, 0)
+    })
 }
 
 fn by_two_views(

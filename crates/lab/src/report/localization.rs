@@ -173,6 +173,10 @@ pub fn motion_table(found: &MotionEvaluation) -> (Table, String) {
             ("the adapter without its mean motion", found.without_mean),
             ("its mean motion alone", found.constant),
             (
+                "its relational reader",
+                found.relational.as_ref().map(|found| found.ours),
+            ),
+            (
                 "the matched keypoints of both views",
                 two_view.map(|found| found.ours),
             ),

@@ -230,6 +230,7 @@ fn result_of(
     let training = training_plan(given, plan.kind);
     let training = CrossRoomPlan {
         training: &training,
+        relational: None,
         calibration_rooms,
         protocol: &protocol,
     };

@@ -3,6 +3,7 @@
 //! [`calibrate`] runs two steps:
 //!
 //! 1. `error_covariance`: the second moment of motion errors, used by calibrated retrieval.
+//!    A relational reader also gets its error scale (`relational_errors`).
 //! 2. `model`: the error model of a map: frame-to-frame noise of latents; errors of poses estimated
 //!    from the most similar map frames; and how far frames of one room are from the map of another.
 //!
@@ -17,12 +18,13 @@ mod frame_noise;
 mod limits;
 mod match_errors;
 mod model;
+mod relational_errors;
 
 use nalgebra::{Matrix6, Vector6};
 
 use error_covariance::error_covariance;
 
-use seese3_core::adapter::{self, Adapter, ErrorModel, TrainingRecord};
+use seese3_core::adapter::{self, Adapter, ErrorModel, RelationalReader, TrainingRecord};
 use seese3_core::room::RoomId;
 use seese3_core::statistics;
 use seese3_core::training::{self, RoomData, check_rooms};
@@ -109,6 +111,14 @@ pub fn calibrate_retrieval(
     }
 
     let covariance = error_covariance(&adapter, &record, rooms)?;
+    let adapter = match adapter.relational() {
+        Some(reader) => {
+            let factors = relational_errors::error_scale(reader, rooms)?;
+            let reader = RelationalReader::clone(reader).with_error_scale(factors)?;
+            adapter.with_relational(reader)?
+        }
+        None => adapter,
+    };
     record.calibrated_on = rooms
         .iter()
         .map(|data| (data.room.id().clone(), data.revision))

@@ -241,5 +241,6 @@ fn record(
         test: untested,
         train: MotionScores::of(truth, &predicted),
         train_mean_r2: constant_r2(truth, &samples.scale().mean),
+        relational: None,
     })
 }

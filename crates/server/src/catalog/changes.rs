@@ -390,7 +390,7 @@ impl From<seese3_store::Error> for Error {
                 revision,
                 ..
             } => Self::no_revision(&format!("{kind}_revision"), name, *revision),
-            E::UnknownFeatures { .. } | E::WhichFeatures { .. } => {
+            E::UnknownFeatures { .. } | E::WhichFeatures { .. } | E::Join { .. } => {
                 Self::invalid("feature_set", error)
             }
             E::Quota { .. } => Self::Quota {

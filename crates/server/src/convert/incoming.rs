@@ -10,8 +10,8 @@ use seese3_core::features::UNSPECIFIED;
 use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera, Pose, Twist};
 use seese3_core::navigation::NavigatorKind;
 use seese3_core::navigation::{
-    FitOn, MAX_TRANSLATION_M, Mode, Query, Reading, RequestedMotion, RetrievalMetric, Source,
-    SourceAt, StepKind,
+    FitOn, MAX_TRANSLATION_M, Method, Mode, Query, Reading, RequestedMotion, RetrievalMetric,
+    Source, SourceAt, StepKind,
 };
 use seese3_core::room::FrameId;
 use seese3_core::splits::{Pair, Split};
@@ -365,7 +365,7 @@ pub fn query(
     } = request;
 
     let motion = requested_motion(motion, &room)?;
-    let (step, metric) = step_of(&navigator, inverse_variant)?;
+    let method = method_of(&navigator, inverse_variant)?;
 
     let mode = mode_of(step_mode)?;
     let exclude_source = exclusion(exclude_source, exclude_radius)?;
@@ -390,20 +390,19 @@ pub fn query(
         motion,
         steps: steps.unwrap_or(1),
         mode,
-        step,
-        metric,
+        method,
         fit_on: fit_on(adapter),
         top_k: top_k.unwrap_or(1),
         exclude_source,
     })
 }
 
-/// Latent step method and retrieval metric of the navigator `name`; if empty, inverse Poincaré in
-/// the given variant.
-fn step_of(name: &str, variant: i32) -> Result<(StepKind, RetrievalMetric), Error> {
+/// The method of the navigator `name`; if empty, inverse Poincaré in the given variant.
+fn method_of(name: &str, variant: i32) -> Result<Method, Error> {
     let given = variant_of(variant)?;
     if name.is_empty() {
-        return Ok((StepKind::InversePoincare(given), RetrievalMetric::Full));
+        let step = StepKind::InversePoincare(given);
+        return Ok(Method::Latent(step, RetrievalMetric::Full));
     }
 
     // A navigator name determines the variant; a separate one could only contradict it.
@@ -415,7 +414,8 @@ fn step_of(name: &str, variant: i32) -> Result<(StepKind, RetrievalMetric), Erro
     }
 
     match navigator_named("navigator", name)? {
-        NavigatorKind::Step(step, metric) => Ok((step, metric)),
+        NavigatorKind::Step(step, metric) => Ok(Method::Latent(step, metric)),
+        NavigatorKind::Relational => Ok(Method::Relational),
         _ => Err(Error::invalid(
             "navigator",
             format!("'{name}' is a baseline of Evaluate; it makes no latent step"),

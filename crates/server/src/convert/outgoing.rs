@@ -12,7 +12,7 @@ use seese3_core::geometry::{CameraIntrinsics, Distortion, Pose, Twist};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::navigation::NavigatorKind;
 use seese3_core::navigation::{
-    AnswerStep, Mode, Query, Reading, RetrievedFrame, StepError, StepKind,
+    AnswerStep, Method, Mode, Query, Reading, RetrievedFrame, StepError, StepKind,
 };
 use seese3_core::room::Room;
 use seese3_core::splits::Split;
@@ -87,8 +87,8 @@ pub fn step_to_wire(
             .requested_pose
             .map(|pose| pose_to_wire(&pose, room.id().as_str())),
         error: step.error.map(|error| error_to_wire(&error)),
-        latent: Some(pb::Latent {
-            values: step.latent.to_vec(),
+        latent: step.latent.as_ref().map(|latent| pb::Latent {
+            values: latent.to_vec(),
             adapter: Some(adapter.clone()),
         }),
     }
@@ -110,20 +110,27 @@ pub fn navigator_names(adapter: &Adapter) -> Vec<String> {
             .any(|corrector| corrector.kind() == *kind),
         StepKind::InversePoincare(_) | StepKind::Refit(_) => true,
     };
+    let relational = adapter
+        .relational()
+        .map(|_| NavigatorKind::Relational.name());
     StepKind::all()
         .into_iter()
         .filter(has)
         .map(StepKind::name)
+        .chain(relational)
         .collect()
 }
 
 /// The name of the query's navigator.
 pub fn navigator_to_wire(query: &Query) -> String {
-    NavigatorKind::Step(query.step, query.metric).name()
+    query.method.navigator().name()
 }
 
-/// The variant of a step's inverse; unspecified for a navigator without one.
-pub fn variant_to_wire(step: StepKind) -> pb::InverseVariant {
+/// The variant of a method's inverse; unspecified for a navigator without one.
+pub fn variant_to_wire(method: Method) -> pb::InverseVariant {
+    let Method::Latent(step, _) = method else {
+        return pb::InverseVariant::Unspecified;
+    };
     match step {
         StepKind::InversePoincare(Reading::Affine) => pb::InverseVariant::Affine,
         StepKind::InversePoincare(Reading::Homogeneous) => pb::InverseVariant::Homogeneous,
@@ -203,6 +210,7 @@ pub fn source_to_wire(source: &FeatureSource) -> pb::FeatureSource {
         pooling,
         preprocess,
         dim,
+        parts,
     } = source.clone();
 
     pb::FeatureSource {
@@ -214,6 +222,7 @@ pub fn source_to_wire(source: &FeatureSource) -> pb::FeatureSource {
         dim: dim as u32,
         layer_index_base: base_to_wire(&base).into(),
         final_norm: norm_to_wire(&norm).into(),
+        parts: parts.iter().map(source_to_wire).collect(),
     }
 }
 

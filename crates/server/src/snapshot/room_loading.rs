@@ -204,15 +204,18 @@ impl RoomLoader {
             keypoints,
         } = loading;
         let source = adapter.adapter.source();
-        let features = stored
-            .features
-            .iter()
-            .find(|set| set.source().is_like(source));
+        let refused = |problem| Problem::Navigator {
+            adapter: adapter.name.clone(),
+            problem,
+        };
+        let features = Features::of_source(&stored.features, source);
+        let features = features.map_err(|problem| refused(problem.into()))?;
         let features = features.ok_or_else(|| seese3_store::Error::UnknownFeatures {
             room: room.id().to_string(),
             name: source.name.clone(),
             known: Vec::new(),
         })?;
+        let features: &Features = &features;
 
         let navigator = Navigator::new(
             (*room).clone(),
@@ -220,10 +223,7 @@ impl RoomLoader {
             adapter.adapter.clone(),
             self.index,
         )
-        .map_err(|problem| Problem::Navigator {
-            adapter: adapter.name.clone(),
-            problem,
-        })?;
+        .map_err(refused)?;
         log_audit(&navigator, &adapter.name);
 
         let navigator = Arc::new(navigator);

@@ -210,6 +210,7 @@ pub fn record() -> TrainingRecord {
         room_tests: vec![scores],
         train: scores,
         train_mean_r2: -0.1,
+        relational: None,
     }
 }
 

@@ -25,6 +25,7 @@ mod memory;
 mod navigators;
 mod operations;
 mod refusals;
+mod relational;
 mod reload;
 mod revisions;
 mod room_memory;

@@ -10,6 +10,7 @@
 mod dying;
 mod extension;
 mod faults;
+mod relational;
 mod room_keypoints;
 mod simulation;
 mod store;

@@ -9,8 +9,8 @@ use seese3_core::adapter::{Adapter, Reading};
 use seese3_core::cancel::Cancellation;
 use seese3_core::geometry::{PoseError, Twist, body_twist, exp};
 use seese3_core::navigation::{
-    FitOn, IndexKind, Limits, Mode, Navigator, Query, RequestedMotion, RetrievalMetric, Source,
-    SourceAt, StepKind,
+    FitOn, IndexKind, Limits, Method, Mode, Navigator, Query, RequestedMotion, RetrievalMetric,
+    Source, SourceAt, StepKind,
 };
 use seese3_core::room::FrameId;
 use seese3_core::splits::{Pair, Split};
@@ -138,8 +138,10 @@ fn walked(navigator: &Navigator, pair: Pair) -> Result<Vec<u32>, Error> {
         motion: RequestedMotion::TargetFrame(pair.target),
         steps: STEPS,
         mode: Mode::OpenLoop,
-        step: StepKind::InversePoincare(Reading::Homogeneous),
-        metric: RetrievalMetric::Full,
+        method: Method::Latent(
+            StepKind::InversePoincare(Reading::Homogeneous),
+            RetrievalMetric::Full,
+        ),
         // Used only by refits; inverse Poincaré ignores this field.
         fit_on: FitOn {
             split: Split::Time,
