@@ -16,7 +16,7 @@ use crate::room::FrameId;
 /// Number of frames that the reader compares with the source view. Rooms of up to this many frames
 /// are searched completely.
 ///
-/// docs/relational.md has hits and time by this number.
+/// docs/relational.md has the hits by this number.
 pub const SHORTLIST: usize = 1_024;
 
 /// The views of a room for relational navigation.

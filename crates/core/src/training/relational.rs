@@ -97,17 +97,18 @@ fn check_config(config: &RelationalConfig) -> Result<(), Error> {
         }
     }
 
-    for (what, given, most) in [
-        ("the share of far pairs", config.far_share, 1.0),
-        ("the noise of a reader", config.noise, 10.0),
-        ("the decay of a reader's average", config.average, 0.999_999),
+    for (what, given, most, bound) in [
+        ("the share of far pairs", config.far_share, 1.0, "0 to 1"),
+        ("the noise of a reader", config.noise, 10.0, "0 to 10"),
+        (
+            "the decay of a reader's average",
+            config.average,
+            0.999_999,
+            "at least 0 and under 1",
+        ),
     ] {
         if !(0.0..=most).contains(&given) {
-            return Err(Error::Rate {
-                what,
-                bound: "at least 0 and not too large",
-                given,
-            });
+            return Err(Error::Rate { what, bound, given });
         }
     }
 

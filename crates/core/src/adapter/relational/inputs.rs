@@ -64,9 +64,7 @@ impl InputLayout {
             rest = after;
         }
     }
-}
 
-impl InputLayout {
     /// Writes the inputs of a pair in reverse order, second image first, from those in order.
     pub fn write_reversed(&self, inputs: &[f32], out: &mut [f32]) {
         let mut first = 0;

@@ -314,6 +314,7 @@ mod tests {
     use nalgebra::{Matrix6, Vector6};
 
     use super::*;
+    use crate::geometry::exp;
 
     fn wave(index: usize) -> f64 {
         ((index * index) as f64 * 0.37 + 0.5).sin()
@@ -353,6 +354,18 @@ mod tests {
             let expected = (at(1e-6) - at(-1e-6)) / 2e-6;
             assert!((gradient[place] - expected).abs() < 1e-6, "output {place}");
         }
+    }
+
+    /// Oracle: the definition. Mirroring the world left to right turns a pose T into M T M with M =
+    /// diag(−1, 1, 1, 1).
+    #[test]
+    fn a_mirrored_twist_is_the_motion_of_the_mirrored_camera() {
+        let twist = [0.3, -0.2, 0.5, 0.1, -0.4, 0.2];
+        let pose = |twist: [f64; 6]| exp(&Twist::from_vector(&twist.into())).to_homogeneous();
+        let mirror = nalgebra::Matrix4::from_diagonal(&[-1.0, 1.0, 1.0, 1.0].into());
+
+        let expected = mirror * pose(twist) * mirror;
+        assert!((pose(mirrored_twist(twist)) - expected).norm() < 1e-12);
     }
 
     /// Oracle: central differences of the loss, for some numbers of every tensor.
