@@ -22,6 +22,7 @@ use clap::{ArgMatches, Args, Command, CommandFactory, FromArgMatches, Subcommand
 use super::Cli;
 use super::examples::with_examples;
 use super::help::{with_comma_lists, with_headings};
+use super::made_by::remember_call;
 use super::output::say;
 use super::serve::Serve;
 
@@ -140,7 +141,8 @@ pub fn parse() -> anyhow::Result<Cli> {
         });
     }
 
-    let matches = command.get_matches_from(arguments);
+    let matches = command.get_matches_from(&arguments);
+    remember_call(&arguments, &matches);
     let mut cli = Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit());
     cli.remember(&matches);
     Ok(cli)

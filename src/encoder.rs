@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use clap::Args;
 
+use super::made_by::remember_encoder_runtime;
 use super::named::one_of;
 use super::output::say;
 use seese3_core::features::FeatureSource;
@@ -223,6 +224,7 @@ impl EncoderOptions {
                 window as usize
             });
 
+        remember_encoder_runtime(runtime.kind.name());
         let layers = names.iter().map(layer).collect();
         Ok(Encoder::model(
             ModelTask {

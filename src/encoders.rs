@@ -37,7 +37,7 @@ impl Encoders {
         };
 
         let records: Vec<_> = chosen.iter().map(|recipe| recipe_json(recipe)).collect();
-        self.json.write(&records)?;
+        self.json.write(&json!({ "encoders": records }))?;
 
         if self.name.is_none() {
             say(WITHOUT_RECIPE);

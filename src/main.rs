@@ -5,6 +5,7 @@ mod camera;
 mod examples;
 mod help;
 mod log;
+mod made_by;
 mod named;
 mod output;
 #[cfg(feature = "lab")]

@@ -11,6 +11,8 @@ use clap::Args;
 use seese3_client::one_line;
 use serde::Serialize;
 
+use super::made_by::MadeBy;
+
 /// Whether text output is turned off. A static, because standard output belongs to the process.
 static IS_SILENT: AtomicBool = AtomicBool::new(false);
 
@@ -84,6 +86,7 @@ impl JsonOutput {
         Ok(Some(JsonLines {
             to: std::io::BufWriter::new(to),
             path: path.clone(),
+            is_first: true,
         }))
     }
 }
@@ -92,12 +95,15 @@ impl JsonOutput {
 pub struct JsonLines {
     to: std::io::BufWriter<Box<dyn Write>>,
     path: PathBuf,
+    is_first: bool,
 }
 
 impl JsonLines {
-    /// Writes and flushes one result, because a program may be waiting for it.
+    /// Writes and flushes one result, because a program may be waiting for it. The first one has
+    /// `made_by`.
     pub fn write(&mut self, record: &impl Serialize) -> anyhow::Result<()> {
-        let mut line = serde_json::to_vec(record)?;
+        let made_by = std::mem::take(&mut self.is_first).then(MadeBy::now);
+        let mut line = serde_json::to_vec(&Signed { record, made_by })?;
         line.push(b'\n');
         let written = self.to.write_all(&line).and_then(|()| self.to.flush());
 
@@ -214,11 +220,28 @@ pub fn check_folder(path: &Path) -> anyhow::Result<()> {
     }
 }
 
-/// Writes indented JSON, with a newline at the end, to a file or to standard output.
+/// A result with what made it.
+#[derive(Serialize)]
+struct Signed<'a, T> {
+    #[serde(flatten)]
+    record: &'a T,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    made_by: Option<MadeBy>,
+}
+
+/// Writes a result and what made it as indented JSON, with a newline at the end, to a file or to
+/// standard output. The record must be an object.
 pub fn write_json(path: &Path, record: &impl Serialize) -> anyhow::Result<()> {
-    let mut text = serde_json::to_string_pretty(record)?;
+    let made_by = Some(MadeBy::now());
+    let mut text = serde_json::to_string_pretty(&Signed { record, made_by })?;
     text.push('\n');
     write_result(path, text.as_bytes())
+}
+
+/// Writes a record that a later run of the same command reads, as indented JSON without `made_by`.
+#[cfg(feature = "lab")]
+pub fn write_intermediate(path: &Path, record: &impl Serialize) -> anyhow::Result<()> {
+    write_file(path, &serde_json::to_vec_pretty(record)?)
 }
 
 /// Writes results to a file, or to standard output.

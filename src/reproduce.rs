@@ -20,7 +20,7 @@ use seese3_lab::reproduction::{
     ReproductionRecord, adapter_names, check, reproduce,
 };
 
-use super::output::{JsonOutput, say, write_file, write_json};
+use super::output::{JsonOutput, say, write_file, write_intermediate, write_json};
 use super::progress::bar;
 use super::rooms::{data, load_rooms};
 use seese3_encoder::{encode_png, read_image};
@@ -229,7 +229,7 @@ impl FolderJournal {
             }
             say(format_args!("going on from {}", folder.display()));
         } else {
-            write_json(&file, identity)?;
+            write_intermediate(&file, identity)?;
         }
 
         let location = adapters.to_str().context("--out is not UTF-8")?;
@@ -264,7 +264,7 @@ impl Journal for FolderJournal {
     }
 
     fn keep_step(&self, name: &str, step: &Value) -> Result<(), String> {
-        write_json(&self.file(name), step).map_err(|error| format!("{error:#}"))
+        write_intermediate(&self.file(name), step).map_err(|error| format!("{error:#}"))
     }
 
     fn adapter(&self, name: &str) -> Result<Option<(Adapter, TrainingRecord)>, String> {

@@ -107,7 +107,7 @@ async fn list(common: &StoreAndJson) -> anyhow::Result<()> {
     let store = common.open()?;
     let contents = store.contents().await?;
     let listed: Vec<Value> = contents.iter().map(contents_json).collect();
-    common.json.write(&listed)?;
+    common.json.write(&json!({ "contents": listed }))?;
 
     for held in &contents {
         let current = held
@@ -153,7 +153,7 @@ impl Default {
         // Report the resulting defaults in each case.
         let contents = store.contents().await?;
         let listed: Vec<Value> = contents.iter().map(contents_json).collect();
-        self.common.json.write(&listed)?;
+        self.common.json.write(&json!({ "contents": listed }))?;
 
         let chosen: Vec<&Contents> = contents
             .iter()

@@ -9,25 +9,33 @@ use crate::program::Place;
 const URL: &str = "http://localhost/json-schemas.json";
 
 /// Checks the JSON that a command wrote. Commands that ask a server for an answer write the
-/// message of the protocol, which `buf` checks; those of research promise nothing.
+/// message of the protocol, which `buf` checks; those of research promise nothing but `made_by`.
 #[track_caller]
 pub fn check(arguments: &str, written: &Value) {
     let words: Vec<&str> = arguments.split_whitespace().collect();
     let schemas = closed_schemas();
     let commands = &schemas["$defs"]["commands"];
     let names = [words[..words.len().min(2)].join(" "), words[0].to_owned()];
-    let Some(name) = names.iter().find(|name| commands.get(name).is_some()) else {
-        assert!(
-            OTHERS.contains(&words[0]),
-            "{arguments}: no schema in docs/json-schemas.json"
-        );
-        return;
+    let place = match names.iter().find(|name| commands.get(name).is_some()) {
+        Some(name) => format!("commands/{}", name.replace(' ', "%20")),
+        None => {
+            assert!(
+                OTHERS.contains(&words[0]),
+                "{arguments}: no schema in docs/json-schemas.json"
+            );
+            return check_against("made_by", schemas, arguments, &written["made_by"]);
+        }
     };
+    check_against(&place, schemas, arguments, written);
+}
 
+/// Checks JSON against the schema at a place below `$defs`.
+#[track_caller]
+fn check_against(place: &str, schemas: Value, arguments: &str, written: &Value) {
     let mut compiler = Compiler::new();
     compiler.add_resource(URL, schemas).unwrap();
     let mut compiled = Schemas::new();
-    let place = format!("{URL}#/$defs/commands/{}", name.replace(' ', "%20"));
+    let place = format!("{URL}#/$defs/{place}");
     let schema = compiler.compile(&place, &mut compiled).unwrap();
     if let Err(error) = compiled.validate(written, schema) {
         panic!("{arguments}: {error}");
@@ -120,9 +128,21 @@ fn commands_write_the_documented_json() {
 /// Oracle: by hand: a key that no schema has, a missing key and another type are seen.
 #[test]
 fn wrong_json_is_seen() {
+    let made_by = json!({
+        "version": "0.1.0", "commit": null, "command": "seese3 health", "seed": null,
+        "time": "2026-11-28T07:15:35Z",
+        "machine": {"os": "linux", "arch": "x86_64", "cpu": null, "cores": 2},
+        "runtime": {"seconds": 0.1, "encoder": null},
+    });
     let is_right = |written: Value| std::panic::catch_unwind(|| check("health", &written)).is_ok();
-    assert!(is_right(json!({"serving": true})));
-    assert!(!is_right(json!({"serving": true, "extra": 1})));
-    assert!(!is_right(json!({})));
-    assert!(!is_right(json!({"serving": 1})));
+    assert!(is_right(json!({"serving": true, "made_by": made_by})));
+    assert!(!is_right(json!({"serving": true})));
+    assert!(!is_right(
+        json!({"serving": true, "made_by": {"version": "0.1.0"}})
+    ));
+    assert!(!is_right(
+        json!({"serving": true, "made_by": made_by, "extra": 1})
+    ));
+    assert!(!is_right(json!({"made_by": made_by})));
+    assert!(!is_right(json!({"serving": 1, "made_by": made_by})));
 }

@@ -683,12 +683,12 @@ class AsyncClient:
     async def score(
         self,
         room: str,
-        predictions: Sequence[Prediction] | None = None,
-        *,
         sources: npt.ArrayLike | None = None,
         targets: npt.ArrayLike | None = None,
         latents: npt.ArrayLike | None = None,
+        *,
         frames: npt.ArrayLike | None = None,
+        predictions: Sequence[Prediction] | None = None,
         name: str = "mine",
         room_revision: int | None = None,
         adapter: str | None = None,
@@ -703,12 +703,12 @@ class AsyncClient:
 
         Args:
             room: The room.
-            predictions: The predictions, one for each pair; or give them as arrays.
             sources: The source frames of the pairs, (n,).
             targets: The target frames of the pairs, (n,).
             latents: The predicted latents of the targets, (n, k): the server retrieves the nearest candidate of each.
                 Exactly one of `latents` and `frames` is required with `sources` and `targets`.
             frames: The frames that the navigator retrieved, (n,).
+            predictions: The predictions, one for each pair, instead of arrays.
             name: The name of the navigator in the report.
             room_revision: The revision of the room; None for the current one.
             adapter: The adapter of the latents; None for the default of `evaluate`.
@@ -729,7 +729,7 @@ class AsyncClient:
         Example:
             >>> pairs = client.split_pairs("kitchen")
             >>> sources, targets = pairs.test.T
-            >>> mine = client.score("kitchen", sources=sources, targets=targets, frames=sources, split=pairs.split)
+            >>> mine = client.score("kitchen", sources, targets, frames=sources, split=pairs.split)
             >>> print(client.evaluate("kitchen").with_navigator(mine).table())
         """
         request = evaluation_pb2.ScorePredictionsRequest(

@@ -1208,7 +1208,9 @@ class TrackRefusal:
 
 @dataclass(frozen=True)
 class Proportion:
-    """A share of the cases with its 95 % Wilson interval, each 0 to 1.
+    """A share of the cases with its 95 % interval, each 0 to 1.
+
+    Overlapping pairs are correlated, so the interval is computed from the variance between blocks of the recording.
 
     Attributes:
         value: The share.
@@ -1223,6 +1225,26 @@ class Proportion:
     @classmethod
     @understood
     def of(cls, message: evaluation_pb2.Proportion) -> Proportion:
+        return cls(message.value, message.low, message.high)
+
+
+@dataclass(frozen=True)
+class ShareDifference:
+    """The difference of two shares of the same pairs, with its 95 % interval, each -1 to 1.
+
+    Attributes:
+        value: The difference.
+        low: The lower end of the interval.
+        high: The upper end of the interval.
+    """
+
+    value: float
+    low: float
+    high: float
+
+    @classmethod
+    @understood
+    def of(cls, message: evaluation_pb2.ShareDifference) -> ShareDifference:
         return cls(message.value, message.low, message.high)
 
 
@@ -1244,8 +1266,10 @@ class NavigatorScores:
         top1: The share of pairs for which the retrieved frame is the target itself.
         thresholds: The thresholds ε, (k,), meters and radians mixed.
         hits: Hit@ε, the share of pairs with an error below ε, (k,).
-        hits_low: The lower ends of the 95 % Wilson intervals of `hits`, (k,).
+        hits_low: The lower ends of the 95 % intervals of `hits`, (k,); see `Proportion`.
         hits_high: The upper ends, (k,).
+        over_identity: For each threshold, the difference of Hit@ε to that of Identity (standing still) on the same
+            pairs; None for Identity itself, and where the source may not be retrieved.
         translation_m_median: The median distance between the retrieved and the target camera, meters.
         rotation_rad_median: The median angle between them, radians.
         recalls: The share of pairs within a distance (meters) and an angle (degrees), by both.
@@ -1261,6 +1285,7 @@ class NavigatorScores:
     hits: Array
     hits_low: Array
     hits_high: Array
+    over_identity: tuple[ShareDifference | None, ...]
     translation_m_median: float
     rotation_rad_median: float
     recalls: dict[tuple[float, float], Proportion]
@@ -1280,6 +1305,10 @@ class NavigatorScores:
             np.array([hit.value for hit in hits]),
             np.array([hit.low for hit in hits]),
             np.array([hit.high for hit in hits]),
+            tuple(
+                ShareDifference.of(hit.over_identity) if hit.HasField("over_identity") else None
+                for hit in message.hit_rates
+            ),
             message.translation_m_median,
             message.rotation_rad_median,
             {_bounds(one): Proportion.of(one.proportion) for one in message.recalls},
@@ -1461,8 +1490,9 @@ class Evaluation:
         """The scores as a table, a row for each navigator. Needs the extra `seese3[pandas]`.
 
         Columns are `pairs`, their number; `leak`, which is "LEAK" where the scores are not held-out scores, else "";
-        `latent_r2`, the R² of predicted latents, not of motions; for each ε `hit@ε` with the ends of its 95 %
-        interval; and `median_m` and `median_deg`, the error of the retrieved frame.
+        `latent_r2`, the R² of predicted latents, not of motions; for each ε `hit@ε` and `over_identity@ε`, its
+        difference to standing still on the same pairs, both with the ends of their 95 % intervals; and `median_m` and
+        `median_deg`, the error of the retrieved frame.
 
         Raises:
             ImportError: pandas is not installed.
@@ -1480,6 +1510,10 @@ class Evaluation:
                 scores.thresholds, scores.hits, scores.hits_low, scores.hits_high, strict=True
             ):
                 row |= {f"hit@{epsilon:g}": value, f"hit@{epsilon:g} low": low, f"hit@{epsilon:g} high": high}
+            for epsilon, over in zip(scores.thresholds, scores.over_identity, strict=True):
+                title = f"over_identity@{epsilon:g}"
+                ends = (None, None, None) if over is None else (over.value, over.low, over.high)
+                row |= dict(zip((title, f"{title} low", f"{title} high"), ends, strict=True))
             row |= {"median_m": scores.translation_m_median, "median_deg": np.degrees(scores.rotation_rad_median)}
             rows.append(row)
         return pandas.DataFrame(rows).set_index("navigator")

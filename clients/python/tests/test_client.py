@@ -189,18 +189,26 @@ def test_evaluation_and_predictions_of_ones_own(client: seese3.Client, drawn: Pa
     both = report.with_navigator(mine)
     assert [one.name for one in both.navigators][-1] == "stay" and mine.navigators[0].latent_r2 is None
     np.testing.assert_array_equal(both.navigators[-1].hits, scores["identity"].hits)
+    assert [over and over.value for over in mine.navigators[0].over_identity] == [0.0] * len(mine.navigators[0].hits)
+    assert set(scores["identity"].over_identity) == {None}
+    over = scores["random"].over_identity[0]
+    assert over is not None and over.low <= over.value <= over.high
+    np.testing.assert_allclose(over.value, scores["random"].hits[0] - scores["identity"].hits[0], atol=1e-12)
+    assert both.table().loc["random", "over_identity@0.1"] == over.value
     # Frames do not depend on the adapter, and its latents have seen the pairs.
     assert both.table().loc["stay", "leak"] == ""
     with pytest.raises(ValueError, match="different pairs: pair_count"):
-        report.with_navigator(client.score(ROOM, [seese3.Prediction(0, 10, frame=0)], adapter="robot", split="whole"))
+        report.with_navigator(
+            client.score(ROOM, predictions=[seese3.Prediction(0, 10, frame=0)], adapter="robot", split="whole")
+        )
     with pytest.raises(ValueError, match="'stay' is in both"):
         both.with_navigator(mine)
     with pytest.raises(seese3.InvalidFieldError, match="twice"):
-        client.score(ROOM, [seese3.Prediction(0, 10, frame=0)] * 2, adapter="robot")
+        client.score(ROOM, predictions=[seese3.Prediction(0, 10, frame=0)] * 2, adapter="robot")
 
     # By latents, the frames that are retrieved are those nearest to the targets' own latents: the targets.
     latents = client.encode(list(range(10, 20)), room=ROOM).latents
-    exact = client.score(ROOM, sources=range(10), targets=range(10, 20), latents=latents, adapter="robot")
+    exact = client.score(ROOM, range(10), range(10, 20), latents, adapter="robot")
     assert exact.navigators[0].top1.value == 1.0 and exact.stride == 10 and exact.split is None
     assert exact.navigators[0].leaks and exact.leaks
     for arrays in ({"targets": [1]}, {"sources": [1], "targets": [2, 3], "frames": [1]}, {"sources": [0.5]}):

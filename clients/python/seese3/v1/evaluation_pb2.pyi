@@ -125,12 +125,24 @@ class Proportion(_message.Message):
     def __init__(self, value: _Optional[float] = ..., low: _Optional[float] = ..., high: _Optional[float] = ...) -> None: ...
 
 class HitRate(_message.Message):
-    __slots__ = ("threshold", "proportion")
+    __slots__ = ("threshold", "proportion", "over_identity")
     THRESHOLD_FIELD_NUMBER: _ClassVar[int]
     PROPORTION_FIELD_NUMBER: _ClassVar[int]
+    OVER_IDENTITY_FIELD_NUMBER: _ClassVar[int]
     threshold: float
     proportion: Proportion
-    def __init__(self, threshold: _Optional[float] = ..., proportion: _Optional[_Union[Proportion, _Mapping]] = ...) -> None: ...
+    over_identity: ShareDifference
+    def __init__(self, threshold: _Optional[float] = ..., proportion: _Optional[_Union[Proportion, _Mapping]] = ..., over_identity: _Optional[_Union[ShareDifference, _Mapping]] = ...) -> None: ...
+
+class ShareDifference(_message.Message):
+    __slots__ = ("value", "low", "high")
+    VALUE_FIELD_NUMBER: _ClassVar[int]
+    LOW_FIELD_NUMBER: _ClassVar[int]
+    HIGH_FIELD_NUMBER: _ClassVar[int]
+    value: float
+    low: float
+    high: float
+    def __init__(self, value: _Optional[float] = ..., low: _Optional[float] = ..., high: _Optional[float] = ...) -> None: ...
 
 class PoseRecall(_message.Message):
     __slots__ = ("translation_m", "rotation_rad", "proportion")

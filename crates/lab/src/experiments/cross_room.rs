@@ -411,6 +411,7 @@ mod tests {
             translation_m_median: 0.0,
             rotation_rad_median: 0.0,
             pose_recalls: Vec::new(),
+            pairs: Vec::new(),
         };
 
         let row = |name: &str, hits| Row {
@@ -418,6 +419,7 @@ mod tests {
             n: 10,
             latent: None,
             retrieval: retrieval(hits),
+            hits_over_identity: Vec::new(),
             leaks: false,
         };
 

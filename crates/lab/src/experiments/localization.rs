@@ -59,7 +59,7 @@ impl LocalizationProtocol {
 /// Median, with its confidence interval, and 90 % quantile of errors.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ErrorQuantiles {
-    /// The median, with a bootstrap interval over twenty blocks of the recording.
+    /// The median, with its interval over blocks of the recording.
     #[serde(flatten)]
     pub median: RecordedMedian,
     /// The 90 % quantile.

@@ -8,7 +8,9 @@ use rayon::prelude::*;
 use seese3_core::adapter::{Adapter, EpochProgress, Reading, TrainingRecord};
 use seese3_core::cancel::Cancellation;
 use seese3_core::eval::{Protocol, evaluate};
-use seese3_core::navigation::{IndexKind, Navigator, NavigatorKind, RetrievalMetric, StepKind};
+use seese3_core::navigation::{
+    HIT_THRESHOLDS, IndexKind, Navigator, NavigatorKind, RetrievalMetric, StepKind,
+};
 use seese3_core::statistics::Rate;
 use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
 
@@ -88,9 +90,8 @@ fn hit_rate(rooms: &[RoomData<'_>], adapter: &Adapter, plan: &TrainingPlan) -> R
         ..Protocol::paper(plan.stride)
     };
 
-    // Sum hits and pairs, so that each room is weighted by its number of test pairs.
-    let mut hits = 0;
-    let mut pairs = 0;
+    // Blocks of all rooms together, so that each room is weighted by its number of test pairs.
+    let mut blocks = Vec::new();
     for data in rooms {
         let navigator = Navigator::new(
             Arc::new(data.room.clone()),
@@ -105,11 +106,8 @@ fn hit_rate(rooms: &[RoomData<'_>], adapter: &Adapter, plan: &TrainingPlan) -> R
             &mut |_, _| (),
         )?;
 
-        // The paper's first threshold is ε = 0.1.
-        let rate = report.rows[0].retrieval.hits[0].1;
-        hits += rate.successes();
-        pairs += rate.n;
+        blocks.extend(report.rows[0].retrieval.hits_by_block(HIT_THRESHOLDS[0]));
     }
 
-    Ok(Rate::of(hits, pairs))
+    Ok(Rate::of_blocks(&blocks))
 }

@@ -10,10 +10,11 @@ use super::table::Table;
 use crate::json::{BaselinesJson, MotionJson, shaped};
 use seese3_core::eval::{Baselines, Report, RetrievalScores, Row};
 use seese3_core::motion_scores::MotionScores;
-use seese3_core::statistics::Rate;
+use seese3_core::statistics::{MeanInterval, Rate};
 
 /// Two tables with one line per navigator. The first has latent scores and Hit@ε with 95 %
-/// intervals; the second has median pose errors and joint recalls.
+/// intervals over blocks of the recording; the second has the difference to Identity, median pose
+/// errors and joint recalls.
 pub fn evaluation_table(report: &Report) -> String {
     let [scores, poses] = evaluation_tables(report);
     format!("{scores}\n\n{poses}")
@@ -48,8 +49,20 @@ fn evaluation_tables(report: &Report) -> [Table; 2] {
         scores.row(row.label(), cells.into_iter().chain(hits));
     }
 
-    let mut poses = Table::new("navigator | median m | median ° | 5 cm 5° | 10 cm 5° | 50 cm 5°");
+    let least = report.protocol.thresholds.first().copied();
+    let over = least.map_or(String::new(), |epsilon| {
+        format!("Hit@{epsilon} over Identity [95 %] | ")
+    });
+    let mut poses = Table::new(&format!(
+        "navigator | {over}median m | median ° | 5 cm 5° | 10 cm 5° | 50 cm 5°"
+    ));
     for row in &report.rows {
+        let over = least.map(|_| match row.hits_over_identity.first() {
+            Some((_, MeanInterval { mean, low, high })) => {
+                format!("{mean:+.3} [{low:+.3}, {high:+.3}]")
+            }
+            None => "–".to_owned(),
+        });
         let RetrievalScores {
             translation_m_median,
             rotation_rad_median,
@@ -67,7 +80,8 @@ fn evaluation_tables(report: &Report) -> [Table; 2] {
             .iter()
             .filter(|recall| shown.contains(&(recall.translation_m, recall.rotation_deg)))
             .map(|recall| format!("{:.3}", recall.rate.rate));
-        poses.row(row.label(), medians.into_iter().chain(recalls));
+        let cells = over.into_iter().chain(medians).chain(recalls);
+        poses.row(row.label(), cells);
     }
 
     [scores, poses]
@@ -222,6 +236,7 @@ impl Serialize for NavigatorJson<'_> {
             n,
             latent,
             retrieval,
+            hits_over_identity,
             leaks,
         } = self.0;
 
@@ -230,6 +245,10 @@ impl Serialize for NavigatorJson<'_> {
         let hits: BTreeMap<String, Rate> = hits
             .map(|(epsilon, rate)| (epsilon.to_string(), *rate))
             .collect();
+        let over_identity: BTreeMap<String, MeanInterval> = hits_over_identity
+            .iter()
+            .map(|(epsilon, difference)| (epsilon.to_string(), *difference))
+            .collect();
         let twist_error = json!({
             "mean": retrieval.twist_error_mean,
             "median": retrieval.twist_error_median,
@@ -237,7 +256,7 @@ impl Serialize for NavigatorJson<'_> {
         let rotation_deg = retrieval.rotation_rad_median.to_degrees();
 
         // Scores of the predicted latent are null for a navigator that does not predict one.
-        let mut record = to.serialize_struct("Navigator", 13)?;
+        let mut record = to.serialize_struct("Navigator", 14)?;
         record.serialize_field("name", name)?;
         record.serialize_field("leaks", leaks)?;
         record.serialize_field("n", n)?;
@@ -247,6 +266,7 @@ impl Serialize for NavigatorJson<'_> {
         record.serialize_field("top1", &retrieval.top1.rate)?;
         record.serialize_field("top1_interval", &retrieval.top1)?;
         record.serialize_field("hit", &hits)?;
+        record.serialize_field("hit_over_identity", &over_identity)?;
         record.serialize_field("twist_error", &twist_error)?;
         record.serialize_field("median_translation_m", &retrieval.translation_m_median)?;
         record.serialize_field("median_rotation_deg", &rotation_deg)?;

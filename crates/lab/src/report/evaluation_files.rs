@@ -24,6 +24,8 @@ pub fn report_at(report: &Report, thresholds: &[f64]) -> Report {
         row.retrieval
             .hits
             .retain(|(epsilon, _)| thresholds.contains(epsilon));
+        row.hits_over_identity
+            .retain(|(epsilon, _)| thresholds.contains(epsilon));
     }
     narrowed
 }

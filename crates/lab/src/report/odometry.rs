@@ -312,17 +312,20 @@ fn mapless_table(mapless: &MaplessDrift) -> Table {
     table
 }
 
-/// Fraction of frames of other rooms reported LOST, as text with Wilson's 95 % interval.
+/// Fraction of frames of other rooms reported LOST, as text with its 95 % interval over rooms.
 pub fn other_rooms_text(rooms: &[RoomOdometry]) -> String {
     let line = |place: usize, when: &str| {
         let counted = rooms.iter().map(|room| room.other_rooms[place]);
-        let frames = counted.clone().map(|counted| counted.frames).sum();
-        let lost = counted.map(|counted| counted.lost).sum();
-        let rate = Rate::of(lost, frames);
+        let counts: Vec<_> = counted.map(|room| (room.lost, room.frames)).collect();
+        let rate = Rate::of_blocks(&counts);
 
         format!(
-            "frames of other rooms reported LOST, {when}: {lost} of {frames} ({:.4} [{:.4}, {:.4}])",
-            rate.rate, rate.low, rate.high
+            "frames of other rooms reported LOST, {when}: {} of {} ({:.4} [{:.4}, {:.4}])",
+            rate.successes(),
+            rate.n,
+            rate.rate,
+            rate.low,
+            rate.high
         )
     };
 

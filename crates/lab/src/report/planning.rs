@@ -9,29 +9,29 @@ use super::table::Table;
 use crate::experiments::planning::{Planner, PlannerScores, PlanningProtocol, RoomPlanning};
 use seese3_core::statistics::Rate;
 
-/// One line per planner, over the queries of all rooms.
+/// One line per planner, over the queries of all rooms. The interval of several rooms is over
+/// rooms.
 pub fn planning_table(rooms: &[RoomPlanning]) -> Table {
-    type Row = (Planner, PlannerScores);
-    let of_all_rooms = |planner| (planner, all(rooms, planner));
-
-    let columns: [Column<Row>; 8] = [
-        Text("planner", |(planner, _)| planner.title().to_owned()),
-        Number("says reached", 3, |(_, all)| {
+    let columns: [Column<Line>; 8] = [
+        Text("planner", |line| line.planner.title().to_owned()),
+        Number("says reached", 3, |Line { all, .. }| {
             share(all.says_reached, all.questions)
         }),
-        Number("truly there", 3, |(_, all)| {
-            share(all.truly_there, all.questions)
+        Number("truly there", 3, |line| line.truly_there.rate),
+        Text("95 %", |line| {
+            format!(
+                "[{:.3}, {:.3}]",
+                line.truly_there.low, line.truly_there.high
+            )
         }),
-        Text("95 %", |(_, all)| {
-            let there = Rate::of(all.truly_there, all.questions);
-            format!("[{:.3}, {:.3}]", there.low, there.high)
-        }),
-        Number("says reached, not there", 3, |(_, all)| {
+        Number("says reached, not there", 3, |Line { all, .. }| {
             share(all.says_reached - all.truly_there, all.questions)
         }),
-        Number("steps", 1, |(_, all)| share(all.steps, all.truly_there)),
-        Number("longest hop", 2, |(_, all)| all.longest_hop),
-        Text("other rooms: says reached", |(_, all)| {
+        Number("steps", 1, |Line { all, .. }| {
+            share(all.steps, all.truly_there)
+        }),
+        Number("longest hop", 2, |line| line.all.longest_hop),
+        Text("other rooms: says reached", |Line { all, .. }| {
             match all.other_questions {
                 0 => String::new(),
                 questions => format!("{:.3}", share(all.other_says_reached, questions)),
@@ -39,7 +39,38 @@ pub fn planning_table(rooms: &[RoomPlanning]) -> Table {
         }),
     ];
 
-    Table::of(&Planner::ALL.map(of_all_rooms), &columns)
+    Table::of(
+        &Planner::ALL.map(|planner| Line::of(rooms, planner)),
+        &columns,
+    )
+}
+
+/// The scores of a planner.
+struct Line {
+    planner: Planner,
+    /// Over the queries of all rooms.
+    all: PlannerScores,
+    truly_there: Rate,
+}
+
+impl Line {
+    fn of(rooms: &[RoomPlanning], planner: Planner) -> Self {
+        let counts: Vec<(usize, usize)> = rooms
+            .iter()
+            .filter_map(|room| room.scores.get(&planner))
+            .map(|scores| (scores.truly_there, scores.questions))
+            .collect();
+
+        Self {
+            planner,
+            all: all(rooms, planner),
+            truly_there: match counts[..] {
+                // Queries of one room are drawn independently.
+                [(there, questions)] => Rate::of(there, questions),
+                _ => Rate::of_blocks(&counts),
+            },
+        }
+    }
 }
 
 fn all(rooms: &[RoomPlanning], planner: Planner) -> PlannerScores {

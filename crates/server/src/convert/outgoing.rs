@@ -254,6 +254,16 @@ pub fn row_to_wire(row: &Row) -> pb::NavigatorScores {
         ..
     } = &row.retrieval;
 
+    let over_identity = |threshold: f64| {
+        let mut differences = row.hits_over_identity.iter();
+        let (_, difference) = differences.find(|(epsilon, _)| *epsilon == threshold)?;
+        Some(pb::ShareDifference {
+            value: difference.mean,
+            low: difference.low,
+            high: difference.high,
+        })
+    };
+
     pb::NavigatorScores {
         name: row.name.clone(),
         pair_count: row.n as u32,
@@ -268,6 +278,7 @@ pub fn row_to_wire(row: &Row) -> pb::NavigatorScores {
             .map(|(threshold, rate)| pb::HitRate {
                 threshold: *threshold,
                 proportion: Some(proportion_to_wire(rate)),
+                over_identity: over_identity(*threshold),
             })
             .collect(),
         leaks: row.leaks,

@@ -47,8 +47,11 @@ fn compare_hits(what: &str, scores: &pb::NavigatorScores, included: &serde_json:
         let found = hit.proportion.unwrap();
         let [low, high] = [0, 1].map(|end| number(&included["hit_wilson95"][&key][end]));
         near(what, found.value, number(&included["hit"][&key]), 1e-12);
-        near(what, found.low, low, 1e-9);
-        near(what, found.high, high, 1e-9);
+        // Correlated pairs hold less information than independent trials.
+        assert!(
+            found.low <= low + 1e-9 && high <= found.high + 1e-9,
+            "{what} {key}: {found:?}"
+        );
     }
 }
 

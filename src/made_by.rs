@@ -1,0 +1,167 @@
+//! `made_by` of JSON results: what made them, so that a file can be made again.
+
+use std::ffi::OsString;
+use std::sync::OnceLock;
+use std::time::Instant;
+
+use chrono::{DateTime, SecondsFormat, Utc};
+use clap::ArgMatches;
+use serde::Serialize;
+
+/// How the program was called. A static, because the command line belongs to the process.
+static CALL: OnceLock<Call> = OnceLock::new();
+
+/// The runtime of the encoder that was opened first.
+static ENCODER_RUNTIME: OnceLock<&'static str> = OnceLock::new();
+
+#[derive(Debug)]
+struct Call {
+    command: String,
+    seed: Option<u64>,
+    time: DateTime<Utc>,
+    begun: Instant,
+}
+
+/// What made a result.
+#[derive(Debug, Clone, Serialize)]
+pub struct MadeBy {
+    /// The version of the program.
+    version: &'static str,
+    /// The git commit of the program, with "-modified" for a changed tree; `None` if unknown.
+    commit: Option<&'static str>,
+    /// The command line, quoted for a POSIX shell.
+    command: String,
+    /// The value of --seed in effect; `None` for a command without that option.
+    seed: Option<u64>,
+    /// When the command began, RFC 3339 in UTC.
+    time: String,
+    machine: Machine,
+    runtime: Runtime,
+}
+
+#[derive(Debug, Clone, Serialize)]
+struct Machine {
+    os: &'static str,
+    arch: &'static str,
+    /// The processor's model; `None` if the system does not state it.
+    cpu: Option<String>,
+    /// The number of cores that the program may use.
+    cores: usize,
+}
+
+#[derive(Debug, Clone, Serialize)]
+struct Runtime {
+    /// From the start of the command to the result, seconds.
+    seconds: f64,
+    /// The runtime of the ONNX models, for example "tract"; `None` if no model was opened.
+    encoder: Option<&'static str>,
+}
+
+/// Records the command line, for the results of this process.
+pub fn remember_call(arguments: &[OsString], matches: &ArgMatches) {
+    let call = Call {
+        command: quoted(arguments),
+        seed: seed(matches),
+        time: Utc::now(),
+        begun: Instant::now(),
+    };
+    // The command line is parsed once.
+    let _ = CALL.set(call);
+}
+
+/// Records the runtime of an encoder, for the results of this process.
+pub fn remember_encoder_runtime(name: &'static str) {
+    let _ = ENCODER_RUNTIME.set(name);
+}
+
+impl MadeBy {
+    /// Of the running command, until now.
+    pub fn now() -> Self {
+        let call = CALL.get();
+        let time = call.map_or_else(Utc::now, |call| call.time);
+        let seconds = call.map_or(0.0, |call| call.begun.elapsed().as_secs_f64());
+
+        Self {
+            version: env!("CARGO_PKG_VERSION"),
+            commit: option_env!("SEESE3_COMMIT"),
+            command: call.map_or_else(String::new, |call| call.command.clone()),
+            seed: call.and_then(|call| call.seed),
+            time: time.to_rfc3339_opts(SecondsFormat::Secs, true),
+            machine: Machine {
+                os: std::env::consts::OS,
+                arch: std::env::consts::ARCH,
+                cpu: cpu_model(),
+                cores: std::thread::available_parallelism().map_or(1, usize::from),
+            },
+            runtime: Runtime {
+                seconds: (seconds * 1e3).round() / 1e3,
+                encoder: ENCODER_RUNTIME.get().copied(),
+            },
+        }
+    }
+}
+
+/// The value of `--seed` in effect, of the innermost command.
+fn seed(matches: &ArgMatches) -> Option<u64> {
+    let mut innermost = matches;
+    while let Some((_, inner)) = innermost.subcommand() {
+        innermost = inner;
+    }
+    // An unknown name is an error, and means that the command has no such option.
+    let mut values = innermost.try_get_raw("seed").ok()??;
+    values.next()?.to_str()?.parse().ok()
+}
+
+/// The arguments as a line for a POSIX shell.
+fn quoted(arguments: &[OsString]) -> String {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./:=,@%+".contains(c);
+    let words = arguments.iter().enumerate().map(|(position, argument)| {
+        let word = argument.to_string_lossy();
+        // The name of the program, whatever its folder.
+        if position == 0 {
+            "seese3".to_owned()
+        } else if !word.is_empty() && word.chars().all(is_plain) {
+            word.into_owned()
+        } else {
+            format!("'{}'", word.replace('\'', r"'\''"))
+        }
+    });
+    words.collect::<Vec<_>>().join(" ")
+}
+
+/// The processor's model, as Linux states it.
+fn cpu_model() -> Option<String> {
+    let text = std::fs::read_to_string("/proc/cpuinfo").ok()?;
+    let line = text.lines().find(|line| line.starts_with("model name"))?;
+    Some(line.split_once(':')?.1.trim().to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: the quoting rules of POSIX shells.
+    #[test]
+    fn command_lines_are_quoted_for_a_shell() {
+        let arguments = ["/bin/x", "train", "--room", "studio*", "it's", ""].map(OsString::from);
+        assert_eq!(
+            quoted(&arguments),
+            r"seese3 train --room 'studio*' 'it'\''s' ''"
+        );
+    }
+
+    /// Oracle: clap: the default counts, and commands without a seed have none.
+    #[test]
+    fn the_seed_is_that_of_the_innermost_command() {
+        let seed_option = clap::Arg::new("seed").long("seed").default_value("7");
+        let command = || {
+            clap::Command::new("p")
+                .subcommand(clap::Command::new("a").arg(seed_option.clone()))
+                .subcommand(clap::Command::new("b"))
+        };
+        let found = |line: &[&str]| seed(&command().get_matches_from(line));
+        assert_eq!(found(&["p", "a"]), Some(7));
+        assert_eq!(found(&["p", "a", "--seed", "3"]), Some(3));
+        assert_eq!(found(&["p", "b"]), None);
+    }
+}
