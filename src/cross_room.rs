@@ -11,6 +11,7 @@ use super::progress::bar;
 use super::protocol::{ProtocolOptions, ReaderOptions};
 use super::rooms::{data, load_rooms, room_words};
 use super::store_option::StoreAndJson;
+use crate::errors_file::ErrorsFile;
 use crate::table_files::TableFiles;
 use seese3_core::eval::{Protocol, check_thresholds};
 use seese3_core::features::Features;
@@ -21,7 +22,8 @@ use seese3_lab::experiments::cross_room::{
     CrossRoomPlan, CrossRoomProgress, CrossRoomRun, nested_choice, train_and_test,
 };
 use seese3_lab::report::{
-    CrossRoomJson, cross_room_json, cross_room_table, rooms_table, scaling_table,
+    CrossRoomJson, cross_room_errors_file, cross_room_json, cross_room_table, rooms_table,
+    scaling_table,
 };
 use seese3_store::StoredRoom;
 
@@ -78,6 +80,8 @@ pub struct CrossRoom {
     /// Never retrieve the source frame
     #[arg(long)]
     exclude_source: bool,
+    #[command(flatten)]
+    errors: ErrorsFile,
     /// Also print a table with one line per held-out room
     #[arg(long)]
     rooms: bool,
@@ -112,6 +116,7 @@ impl CrossRoom {
     pub async fn run(self) -> anyhow::Result<()> {
         let store = self.common.open()?;
         self.files.begin()?;
+        self.errors.begin()?;
         let train = load_rooms(&store, &self.train, self.features.as_deref()).await?;
         let source = train[0].1.source().name.clone();
 
@@ -186,6 +191,7 @@ impl CrossRoom {
         }
 
         self.say(&train, &test, &plan, &runs)?;
+        self.errors.write(|| cross_room_errors_file(&runs))?;
 
         // The record includes the protocol, which is needed to interpret the scores.
         if self.common.json.is_wanted() {

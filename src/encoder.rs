@@ -148,7 +148,10 @@ impl EncoderOptions {
             }
             "builtin" => Ok(Encoder::builtin()),
             "pixels" => Ok(Encoder::pixels()),
-            _ => self.open_file(Path::new(model), runtime),
+            _ => {
+                remember_encoder_runtime(runtime.kind.name());
+                self.open_file(Path::new(model), runtime)
+            }
         }
     }
 
@@ -224,7 +227,6 @@ impl EncoderOptions {
                 window as usize
             });
 
-        remember_encoder_runtime(runtime.kind.name());
         let layers = names.iter().map(layer).collect();
         Ok(Encoder::model(
             ModelTask {

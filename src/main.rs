@@ -9,6 +9,8 @@ mod made_by;
 mod named;
 mod output;
 #[cfg(feature = "lab")]
+mod errors_file;
+#[cfg(feature = "lab")]
 mod table_files;
 mod encoder;
 mod pose_options;

@@ -18,7 +18,8 @@ use seese3_lab::experiments::matched_localization::{
     self, MappedAndAsked, MatchedLocalization, PeerAnswer, PosedRecording,
 };
 use seese3_lab::report::{
-    LocalizationContext, LocalizationJson, localization_table, matched_localization_table,
+    LocalizationContext, LocalizationJson, estimate_errors_file, localization_table,
+    matched_localization_table,
 };
 
 use super::super::fit::fitting_bar;
@@ -28,6 +29,7 @@ use super::super::progress::bar;
 use super::keypoint_views::KeypointViews;
 use super::peer::{Peer, PeerTask};
 use super::room_images::RoomImages;
+use crate::errors_file::ErrorsFile;
 use crate::table_files::TableFiles;
 use seese3_store::{Store, StoredRoom};
 
@@ -78,6 +80,8 @@ pub struct Localization {
     #[command(flatten)]
     files: TableFiles,
     #[command(flatten)]
+    errors: ErrorsFile,
+    #[command(flatten)]
     json: JsonOutput,
 }
 
@@ -85,6 +89,7 @@ impl Localization {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
         self.files.begin()?;
+        self.errors.begin()?;
         let store = Store::open(&self.store)?;
         if self.adapter.is_none() && !self.fit {
             if self.features.is_some() {
@@ -133,6 +138,8 @@ impl Localization {
             say_rules(rules);
         }
 
+        self.errors
+            .write(|| estimate_errors_file(&self.room, &found.views))?;
         self.write(&features, &found)
     }
 
@@ -186,6 +193,8 @@ impl Localization {
         let (table, notes) = matched_localization_table(&found);
         self.files.say(&table, &self.room)?;
         say(notes);
+        self.errors
+            .write(|| estimate_errors_file(&self.room, &found.views))?;
         self.write::<MatchedLocalization>(features, &found)
     }
 

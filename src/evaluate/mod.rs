@@ -25,6 +25,7 @@ use clap::{Args, Subcommand};
 use super::named::one_of;
 use super::output::{JsonOutput, STANDARD_OUTPUT, check_writable, say, write_file};
 use super::progress::bar;
+use crate::errors_file::{ErrorsFile, parquet};
 use crate::table_files::{plot_file, table_file, write_plot};
 use seese3_core::adapter::TrainingRecord;
 use seese3_core::cancel::Cancellation;
@@ -41,7 +42,7 @@ use seese3_core::training::{motions, predictions};
 use seese3_lab::report::{
     AdapterJson, EvaluationContext, MotionBaselines, RoomJson, baselines_text, curve_thresholds,
     evaluation_csv, evaluation_json, evaluation_latex, evaluation_markdown, evaluation_table,
-    hit_curves, report_at,
+    hit_curves, report_at, retrieval_errors_file,
 };
 use seese3_store::adapter_choice::{
     EvaluatedRoom, EvaluationCandidate, NoDefault, for_evaluation, serving_room,
@@ -155,6 +156,9 @@ struct Navigation {
     /// Markdown
     #[arg(long, value_name = "FILE", value_parser = table_file)]
     table: Option<PathBuf>,
+    /// Also write the errors of every navigator on every pair to this Parquet file
+    #[arg(long, value_name = "FILE.parquet", value_parser = parquet)]
+    errors: Option<PathBuf>,
     // Not flattened: clap could no longer detect whether any option of the table was given.
     /// Also write the results as JSON to this file. With "-" or no value, JSON goes to standard
     /// output, and no text is printed
@@ -170,6 +174,8 @@ impl Navigation {
     async fn run(self) -> anyhow::Result<()> {
         let json = JsonOutput::to(self.json.clone());
         json.begin()?;
+        let errors = ErrorsFile::to(self.errors.clone());
+        errors.begin()?;
         for file in self.plot.iter().chain(&self.table) {
             check_writable(file)?;
         }
@@ -249,6 +255,7 @@ impl Navigation {
         say(baselines_text(&motion));
 
         self.write_files(&report, &curves)?;
+        errors.write(|| retrieval_errors_file(&self.room, &report.rows))?;
         if json.is_wanted() {
             // The file states what was evaluated and whether it leaks, so that it is
             // self-contained.

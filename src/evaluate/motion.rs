@@ -6,11 +6,12 @@ use seese3_core::eval::has_seen;
 use seese3_core::features::Features;
 use seese3_core::splits::Split;
 use seese3_lab::experiments::motion::{FrameKeypoints, MotionEvaluation, evaluate};
-use seese3_lab::report::{MotionEvaluationJson, motion_table};
+use seese3_lab::report::{MotionEvaluationJson, estimate_errors_file, motion_table};
 
 use super::super::output::{JsonOutput, say};
 use super::super::progress::bar;
 use super::keypoint_views::KeypointViews;
+use crate::errors_file::ErrorsFile;
 use crate::table_files::TableFiles;
 use seese3_store::{Store, StoredAdapter};
 
@@ -37,6 +38,8 @@ pub struct Motion {
     #[command(flatten)]
     files: TableFiles,
     #[command(flatten)]
+    errors: ErrorsFile,
+    #[command(flatten)]
     json: JsonOutput,
 }
 
@@ -44,6 +47,7 @@ impl Motion {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
         self.files.begin()?;
+        self.errors.begin()?;
 
         let store = Store::open(&self.store)?;
         let stored = store.load_room(&self.room, None).await?;
@@ -103,6 +107,8 @@ impl Motion {
             say_adapter(adapter, in_room == Some(true));
         }
         self.say_table(&found)?;
+        self.errors
+            .write(|| estimate_errors_file(&self.room, &found.pairs))?;
         self.json.write(&MotionEvaluationJson {
             found: &found,
             room: &self.room,

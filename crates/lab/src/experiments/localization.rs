@@ -15,7 +15,7 @@ use seese3_robot::fitting::{
     FitRun, Fitted, Localizer, MotionHypotheses, MotionReader, ReadingRules, fit,
 };
 
-use super::Error;
+use super::{Error, EstimateError};
 
 /// Which frames are mapped, and which are queried.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -119,6 +119,9 @@ pub struct Localization {
     pub fitted: Option<LocalizationErrors>,
     /// Scores of the rules, if an adapter was fitted.
     pub rules: Option<RuleScores>,
+    /// The errors of every view, by method.
+    #[serde(skip)]
+    pub views: Vec<EstimateError>,
 }
 
 /// How often the rules fell back to the nearest frame, and the coverage of their covariances.
@@ -178,13 +181,34 @@ pub fn evaluate(
         .iter()
         .map(|frame| View::of(data, &localizer, *frame))
         .collect::<Result<_, Error>>()?;
+    let mut kept = Vec::new();
+    let mut keep = |method: &'static str, errors: Vec<PoseError>, squared_lengths: &[f64]| {
+        let scores = LocalizationErrors::of(&errors);
+        let rows = asked.iter().zip(errors).enumerate();
+        kept.extend(rows.map(|(place, (&target, error))| EstimateError {
+            method,
+            source: None,
+            target,
+            error: Some(error),
+            squared_length: squared_lengths.get(place).copied().unwrap_or(f64::NAN),
+        }));
+        scores
+    };
     let by = |reader: MotionReader| errors_by(&views, &localizer, reader);
 
-    let zero_shot = adapter.map(|_| by(MotionReader::ZeroShot));
-    let with_rules = fitted
-        .as_ref()
-        .map(|Fitted { rules, .. }| by_rules(&views, &localizer, rules));
-    let nearest_frame = by(MotionReader::NearestFrame);
+    let zero_shot = adapter.map(|_| keep("zero_shot", by(MotionReader::ZeroShot), &[]));
+    let with_rules = fitted.as_ref().map(|Fitted { rules, .. }| {
+        let found = by_rules(&views, &localizer, rules);
+        let errors = keep("ours", found.errors, &found.squared_lengths);
+        (errors, found.scores)
+    });
+    let nearest_frame = keep("nearest_frame", by(MotionReader::NearestFrame), &[]);
+    let nearest_pose = keep(
+        "nearest_pose",
+        nearest_poses(&views, &mapped, data.room.poses()),
+        &[],
+    );
+    let fitted = fitted.map(|_| keep("fitted", by(MotionReader::Fitted), &[]));
 
     Ok(Localization {
         asked: views.len(),
@@ -195,10 +219,11 @@ pub fn evaluate(
             (None, None) => nearest_frame,
         },
         nearest_frame,
-        nearest_pose: nearest_poses(&views, &mapped, data.room.poses()),
+        nearest_pose,
         zero_shot,
-        fitted: fitted.as_ref().map(|_| by(MotionReader::Fitted)),
+        fitted,
         rules: with_rules.map(|(_, scores)| scores),
+        views: kept,
     })
 }
 
@@ -218,28 +243,27 @@ impl<'a> View<'a> {
     }
 }
 
-fn errors_by(
-    views: &[View<'_>],
-    localizer: &Localizer,
-    reader: MotionReader,
-) -> LocalizationErrors {
-    let errors: Vec<PoseError> = views
+fn errors_by(views: &[View<'_>], localizer: &Localizer, reader: MotionReader) -> Vec<PoseError> {
+    views
         .iter()
         .map(|view| {
             let motion = view.readings.by(reader).unwrap_or_default();
             let pose = localizer.pose(view.readings.nearest.frame) * exp(&motion);
             PoseError::between(view.truth, &pose)
         })
-        .collect();
-
-    LocalizationErrors::of(&errors)
+        .collect()
 }
 
-fn by_rules(
-    views: &[View<'_>],
-    localizer: &Localizer,
-    rules: &ReadingRules,
-) -> (LocalizationErrors, RuleScores) {
+/// The answers by the rules.
+struct RuledErrors {
+    /// One per view.
+    errors: Vec<PoseError>,
+    /// Squared Mahalanobis lengths of the errors; NaN for a singular covariance.
+    squared_lengths: Vec<f64>,
+    scores: RuleScores,
+}
+
+fn by_rules(views: &[View<'_>], localizer: &Localizer, rules: &ReadingRules) -> RuledErrors {
     let mut errors = Vec::with_capacity(views.len());
     let mut squared_lengths = Vec::with_capacity(views.len());
     let mut translations_unread = 0;
@@ -251,7 +275,8 @@ fn by_rules(
 
         let error = log(&located.pose.pose.inv_mul(view.truth)).to_vector();
         let cholesky = located.pose.covariance.cholesky();
-        squared_lengths.extend(cholesky.map(|cholesky| error.dot(&cholesky.solve(&error))));
+        squared_lengths
+            .push(cholesky.map_or(f64::NAN, |cholesky| error.dot(&cholesky.solve(&error))));
 
         let is_unread = |reader| usize::from(reader == MotionReader::NearestFrame);
         translations_unread += is_unread(located.translation.reader);
@@ -264,11 +289,15 @@ fn by_rules(
         rotation_unread: share(rotations_unread),
         coverage: coverage(&squared_lengths),
     };
-    (LocalizationErrors::of(&errors), scores)
+    RuledErrors {
+        errors,
+        squared_lengths,
+        scores,
+    }
 }
 
 /// Errors of the mapped frames with the nearest true poses, by meters plus radians.
-fn nearest_poses(views: &[View<'_>], mapped: &[FrameId], poses: &[Pose]) -> LocalizationErrors {
+fn nearest_poses(views: &[View<'_>], mapped: &[FrameId], poses: &[Pose]) -> Vec<PoseError> {
     let nearest = |view: &View<'_>| {
         mapped
             .iter()
@@ -279,8 +308,7 @@ fn nearest_poses(views: &[View<'_>], mapped: &[FrameId], poses: &[Pose]) -> Loca
             })
     };
 
-    let errors: Vec<PoseError> = views.iter().filter_map(nearest).collect();
-    LocalizationErrors::of(&errors)
+    views.iter().filter_map(nearest).collect()
 }
 
 #[cfg(test)]

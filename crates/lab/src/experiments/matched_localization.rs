@@ -19,8 +19,8 @@ use seese3_core::statistics::{
 use seese3_robot::localization::{KeypointRoom, LocatedView, NotLocated};
 use seese3_robot::matched_views::{Mapping, MappingParameters, ViewKeypoints};
 
-use super::Error;
 use super::localization::LocalizationErrors;
+use super::{Error, EstimateError};
 
 /// A view is near the map if a mapped view is within these meters and radians of it.
 const NEAR_M: f64 = 0.25;
@@ -129,6 +129,9 @@ pub struct MatchedLocalization {
     /// Median time to match a view and estimate its pose, milliseconds on one core; without the
     /// encoder.
     pub match_ms: f64,
+    /// The errors of every view, by method.
+    #[serde(skip)]
+    pub views: Vec<EstimateError>,
 }
 
 /// Which frames are mapped and which are asked for.
@@ -229,6 +232,10 @@ pub fn evaluate(
         near: part(&|view| view.is_near),
         far: part(&|view| !view.is_near),
         match_ms: 1e3 * seese3_core::statistics::median(&seconds),
+        views: views
+            .iter()
+            .flat_map(|view| view.errors(&answers))
+            .collect(),
     })
 }
 
@@ -445,6 +452,32 @@ fn comparison(views: &[&View], peer: &BTreeMap<FrameId, Option<Pose>>) -> Option
 }
 
 impl View {
+    /// The errors of every method on this view; of the peer, if it was asked for it.
+    fn errors(&self, peer: &BTreeMap<FrameId, Option<Pose>>) -> Vec<EstimateError> {
+        let of = |method, pose: Option<Pose>, squared_length| EstimateError {
+            method,
+            source: None,
+            target: self.frame,
+            error: pose.map(|pose| self.error(&pose)),
+            squared_length,
+        };
+        let located = |method, found: &Result<Located, NotLocated>| match found {
+            Ok(found) => of(method, Some(found.pose), found.squared_length),
+            Err(_) => of(method, None, f64::NAN),
+        };
+
+        let mut errors = vec![
+            located("ours", &self.located),
+            located("near_prediction", &self.near_prediction),
+            of("nearest_frame", Some(self.nearest), f64::NAN),
+            of("blend", Some(self.blend), f64::NAN),
+        ];
+        if let Some(answer) = peer.get(&self.frame) {
+            errors.push(of("peer", *answer, f64::NAN));
+        }
+        errors
+    }
+
     fn error(&self, pose: &Pose) -> PoseError {
         PoseError::between(&self.truth, pose)
     }

@@ -19,6 +19,7 @@
 
 pub mod adapter_sweep;
 pub mod cross_room;
+mod estimate_error;
 pub mod folds;
 pub mod formulations;
 pub mod layers;
@@ -42,6 +43,8 @@ pub mod tracked_room;
 pub mod tracking_fit;
 pub mod tracking_intervals;
 pub mod tracking_scores;
+
+pub use estimate_error::EstimateError;
 
 use seese3_core::room::Room;
 use seese3_core::splits::HoldOut;

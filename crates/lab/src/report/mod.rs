@@ -9,6 +9,7 @@ mod cross_room;
 mod dot_plot;
 mod figure;
 mod document;
+mod errors_file;
 mod evaluation;
 mod evaluation_files;
 mod formulations;
@@ -35,6 +36,7 @@ pub use cross_room::{
 };
 pub use document::{Block, Document, Picture, Section};
 pub use dot_plot::dot_plot;
+pub use errors_file::{cross_room_errors_file, estimate_errors_file, retrieval_errors_file};
 pub use evaluation::{
     AdapterJson, EvaluationContext, EvaluationJson, MotionBaselines, RoomJson, baselines_text,
     evaluation_json, evaluation_markdown, evaluation_table,
