@@ -86,6 +86,9 @@ evaluate trajectory
   seese3 evaluate trajectory --reference truth.tum --estimate run.tum
 probe
   seese3 probe --store store --room kitchen --features pixels --stride 20 --split folds
+benchmark
+  seese3 benchmark freeze --store suite --room 'studio7-*' --name rooms-7 --out rooms-7.json
+  seese3 benchmark score --benchmark rooms-7.json --store suite mine.json --page results.md
 cross-room
   seese3 cross-room --store suite --train 'studio7-000*' --test 'studio7-001*' --sizes 5,10
 sweep

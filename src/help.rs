@@ -41,6 +41,7 @@ const HEADINGS: [(&str, &[&str]); 4] = [
             "probe",
             "sweep",
             "cross-room",
+            "benchmark",
             "reproduce",
             "theory",
             "studio",

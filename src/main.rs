@@ -57,6 +57,8 @@ mod import;
 #[cfg(feature = "lab")]
 mod studio;
 #[cfg(feature = "lab")]
+mod benchmark;
+#[cfg(feature = "lab")]
 mod cross_room;
 
 use std::io::Write;
@@ -177,6 +179,9 @@ enum Command {
     /// by number of training rooms
     CrossRoom(cross_room::CrossRoom),
     #[cfg(feature = "lab")]
+    /// Freeze rooms and pairs as a benchmark, and score submissions of retrieved frames
+    Benchmark(benchmark::BenchmarkCommand),
+    #[cfg(feature = "lab")]
     /// Compare many layers, adapter configurations or formulations in one run
     Sweep(sweep::Sweep),
     #[cfg(feature = "lab")]
@@ -261,6 +266,8 @@ async fn dispatch(cli: Cli) -> anyhow::Result<()> {
         Command::Probe(arguments) => arguments.run().await,
         #[cfg(feature = "lab")]
         Command::CrossRoom(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
+        Command::Benchmark(arguments) => arguments.run().await,
         #[cfg(feature = "lab")]
         Command::Sweep(arguments) => arguments.run().await,
         #[cfg(feature = "lab")]

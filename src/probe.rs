@@ -17,7 +17,7 @@ use seese3_core::training::{RoomData, TrainingPlan};
 use seese3_lab::experiments::probe::{
     DimensionProtocol, DimensionScore, ProbeProtocol, ProbeScores, probe, probe_adapters,
 };
-use seese3_lab::probes::{Counted, Duplicates, Limit, MutualKnn};
+use seese3_lab::probes::{Counted, Limit, MutualKnn};
 use seese3_lab::report::{ProbeJson, ProbedRooms, probe_plot, probe_table};
 use seese3_store::StoredRoom;
 
@@ -73,9 +73,6 @@ pub struct Probe {
     /// camera path rather than that of the room
     #[arg(long, default_value_t = 10)]
     m2_gap: usize,
-    /// M2: keep the first of identical rows, instead of dropping all of them
-    #[arg(long)]
-    m2_keep_first: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -113,7 +110,7 @@ fn say_conditions(scores: &[ProbeScores]) {
         };
 
         say(format_args!(
-            "M2 of {}: {} rows used, {} dropped as duplicates, gap {}",
+            "M2 of {}: {} rows used, {} copies of them left out, gap {}",
             score.room, dimension.used, dimension.dropped, protocol.gap
         ));
     }
@@ -244,14 +241,7 @@ impl Probe {
                 Limit::Inclusive
             },
         };
-        let dimension = DimensionProtocol {
-            gap: self.m2_gap,
-            duplicates: if self.m2_keep_first {
-                Duplicates::KeepFirst
-            } else {
-                Duplicates::DropRows
-            },
-        };
+        let dimension = DimensionProtocol { gap: self.m2_gap };
 
         ProbeProtocol {
             m1: wants(MetricName::M1).then_some(mutual_knn),

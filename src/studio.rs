@@ -42,7 +42,7 @@ pub struct Studio {
     /// Kind of rooms and of their recordings
     #[arg(long, default_value = "visits", value_parser = one_of::<Suite>())]
     suite: Suite,
-    /// Variations that are turned off in the suites `visits` and `returns`, separated by commas,
+    /// Variations that are turned off in all suites but `walks`, separated by commas,
     /// for ablations; the poses stay the same
     #[arg(long, value_delimiter = ',', value_name = "VARIATIONS", value_parser = one_of::<Variation>())]
     without: Vec<Variation>,
@@ -92,7 +92,7 @@ impl Studio {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
         if self.suite == Suite::Walks && !self.without.is_empty() {
-            bail!("--without needs --suite visits or returns: walks have no variations");
+            bail!("--without needs --suite visits, returns or scans: walks have no variations");
         }
         if let Some(file) = &self.sheet {
             return self.sheet(file);
@@ -226,7 +226,7 @@ impl Studio {
 
     fn frame_count(&self) -> usize {
         let default = match self.suite {
-            Suite::Visits | Suite::Returns => 1_000,
+            Suite::Visits | Suite::Returns | Suite::Scans => 1_000,
             Suite::Walks => 400,
         };
         self.frames.unwrap_or(default) as usize

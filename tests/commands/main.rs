@@ -8,6 +8,7 @@
 )]
 
 mod basics;
+mod benchmark;
 #[cfg(target_os = "linux")]
 mod disks;
 mod keypoints;

@@ -31,6 +31,7 @@
 //! | [`formulations`] | the paper's alternatives A to D to the adapter |
 //! | [`probes`] | probes M1 to M3 of the SE(3) information in features; M4 trains an adapter |
 //! | [`theory`] | numeric checks of the paper's theorems |
+//! | [`benchmark`] | frozen rooms and pairs, submissions and their scores |
 //! | [`experiments`] | experiments over rooms, with their result types |
 //! | [`report`] | tables, JSON, pictures and documents of the results |
 //! | [`reproduction`] | the paper's tables and figures on given rooms, as one report |
@@ -41,6 +42,7 @@ mod json;
 pub mod formulations;
 pub mod probes;
 pub mod theory;
+pub mod benchmark;
 pub mod experiments;
 pub mod report;
 pub mod reproduction;

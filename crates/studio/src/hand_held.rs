@@ -33,7 +33,29 @@ pub(super) struct Habit {
     pub turning: f64,
     /// The longest rest between two strokes, seconds.
     pub rest: f64,
+    /// The shortest nominal duration of a stroke, seconds.
+    pub shortest: f64,
+    /// Width of the moving average that joins strokes, seconds; 0 to stop at every goal.
+    pub flow: f64,
 }
+
+impl Habit {
+    /// The same room filmed in slow sweeps that flow into each other, as for a 3D scan.
+    pub fn sweeping(self) -> Self {
+        Self {
+            speed: SWEEP_SPEED * self.speed,
+            turning: SWEEP_TURNING * self.turning,
+            rest: 0.0,
+            shortest: 2.0,
+            flow: 1.2,
+            ..self
+        }
+    }
+}
+
+/// Speed and rotation speed of sweeps, in those of strokes.
+const SWEEP_SPEED: f64 = 1.0;
+const SWEEP_TURNING: f64 = 0.8;
 
 /// The standpoints and views in a room, shared by all visits.
 #[derive(Debug, Clone)]
@@ -71,6 +93,14 @@ impl Goals {
         }
     }
 
+    /// The standpoints and views, filmed in another way.
+    pub fn filmed(&self, habit: impl FnOnce(Habit) -> Habit) -> Self {
+        Self {
+            habit: habit(self.habit.clone()),
+            ..self.clone()
+        }
+    }
+
     /// The path of one visit.
     pub fn path(&self, frame_count: usize, random: &mut ChaCha8Rng) -> HandPath {
         let habit = &self.habit;
@@ -80,7 +110,7 @@ impl Goals {
         let positions = strokes(
             frame_count,
             habit.speed,
-            habit.rest,
+            habit.pauses(),
             random,
             |now, random| {
                 let goal = near_one(&self.standpoints, now, MISS[0], random);
@@ -90,11 +120,11 @@ impl Goals {
         let views = strokes(
             frame_count,
             habit.turning,
-            habit.rest,
+            habit.pauses(),
             random,
             |now, random| near_one(&self.views, now, MISS[1], random),
         );
-        let rolls = strokes(frame_count, 0.1, habit.rest, random, |_, random| {
+        let rolls = strokes(frame_count, 0.1, habit.pauses(), random, |_, random| {
             habit.roll * deviation::<1>(random)
         });
 
@@ -148,27 +178,40 @@ impl HandPath {
         &self,
         frame_count: usize,
         bounds: [Vector3<f64>; 2],
+        way: &Return,
         random: &mut ChaCha8Rng,
     ) -> Self {
-        let places = places_on(self.positions.len(), frame_count, random);
-        let beside = strokes(frame_count, BESIDE_SPEED, 1.0, random, |_, random| {
-            let [low, high] = if random.random_bool(ASIDE) {
-                [NEAR_M, FAR_M]
-            } else {
-                [0.0, NEAR_M]
-            };
-            let (sine, cosine) = random.random_range(0.0..std::f64::consts::TAU).sin_cos();
-            SVector::from([cosine, sine]) * random.random_range(low..high)
-        });
-        let turned = strokes(frame_count, TURN_SPEED, 1.0, random, |_, random| {
-            let usual: SVector<f64, 2> = TURN_RAD * deviation(random);
-            let side = random.random_range(ELSEWHERE_RAD[0]..ELSEWHERE_RAD[1]);
-            match random.random_range(0.0..1.0) {
-                share if share < ASIDE / 2.0 => usual + SVector::from([side, 0.0]),
-                share if share < ASIDE => usual - SVector::from([side, 0.0]),
-                _ => usual,
-            }
-        });
+        let places = places_on(self.positions.len(), frame_count, way, random);
+        let beside = strokes(
+            frame_count,
+            way.beside_speed,
+            way.pauses,
+            random,
+            |_, random| {
+                let [low, high] = if random.random_bool(ASIDE) {
+                    [NEAR_M, FAR_M]
+                } else {
+                    [0.0, NEAR_M]
+                };
+                let (sine, cosine) = random.random_range(0.0..std::f64::consts::TAU).sin_cos();
+                SVector::from([cosine, sine]) * random.random_range(low..high)
+            },
+        );
+        let turned = strokes(
+            frame_count,
+            way.turn_speed,
+            way.pauses,
+            random,
+            |_, random| {
+                let usual: SVector<f64, 2> = TURN_RAD * deviation(random);
+                let side = random.random_range(ELSEWHERE_RAD[0]..ELSEWHERE_RAD[1]);
+                match random.random_range(0.0..1.0) {
+                    share if share < ASIDE / 2.0 => usual + SVector::from([side, 0.0]),
+                    share if share < ASIDE => usual - SVector::from([side, 0.0]),
+                    _ => usual,
+                }
+            },
+        );
 
         let [low, high] = bounds;
         let position = |frame: usize| {
@@ -198,29 +241,91 @@ const TURN_RAD: f64 = 0.1;
 const ELSEWHERE_RAD: [f64; 2] = [0.4, 1.2];
 /// Share of the offsets, and of the views, that leave the followed path.
 const ASIDE: f64 = 0.2;
-/// Mean speeds at which offset and view change: meters and radians per second.
-const BESIDE_SPEED: f64 = 0.15;
-const TURN_SPEED: f64 = 0.3;
 /// Range of the speed along a followed path, in speeds of the first visit.
 const PACE: [f64; 2] = [0.5, 1.2];
-/// Range of the length of a stretch in one direction, frames.
-const STRETCH: [usize; 2] = [60, 180];
-/// Share of the stretches that are walked backward.
-const BACKWARD: f64 = 0.3;
+
+/// How a person follows an earlier path.
+#[derive(Debug, Clone)]
+pub(super) struct Return {
+    /// Mean speed at which the offset changes, meters per second.
+    beside_speed: f64,
+    /// Mean speed at which the difference of the views changes, radians per second.
+    turn_speed: f64,
+    /// Of the changes of offset and views.
+    pauses: Pauses,
+    /// Range of the length of a stretch in one direction, frames.
+    stretch: [usize; 2],
+    /// Share of the stretches that are walked backward.
+    backward: f64,
+}
+
+impl Return {
+    /// Like a person who looks around.
+    pub const RESTLESS: Self = Self {
+        beside_speed: 0.15,
+        turn_speed: 0.3,
+        pauses: Pauses::stops(1.0),
+        stretch: [60, 180],
+        backward: 0.3,
+    };
+
+    /// Like a person who scans the room again.
+    pub const SWEEPING: Self = Self {
+        beside_speed: 0.08,
+        turn_speed: 0.12,
+        pauses: Pauses {
+            rest: 0.0,
+            shortest: 2.0,
+            flow: 1.2,
+        },
+        stretch: [150, 450],
+        backward: 0.3,
+    };
+}
+
+/// How strokes follow each other, seconds; as in [`Habit`].
+#[derive(Debug, Clone, Copy)]
+struct Pauses {
+    rest: f64,
+    shortest: f64,
+    flow: f64,
+}
+
+impl Pauses {
+    /// Strokes that stop at every goal.
+    const fn stops(rest: f64) -> Self {
+        Self {
+            rest,
+            shortest: 0.5,
+            flow: 0.0,
+        }
+    }
+}
+
+impl Habit {
+    fn pauses(&self) -> Pauses {
+        Pauses {
+            rest: self.rest,
+            shortest: self.shortest,
+            flow: self.flow,
+        }
+    }
+}
+
 /// A change of speed takes twice this number of frames.
 const SMOOTHED: usize = 8;
 
 /// `frame_count` places on a path of `length` frames, in frames: stretches forward and backward,
 /// each at a constant speed.
-fn places_on(length: usize, frame_count: usize, random: &mut ChaCha8Rng) -> Vec<f64> {
+fn places_on(length: usize, frame_count: usize, way: &Return, random: &mut ChaCha8Rng) -> Vec<f64> {
     let last = length.saturating_sub(1) as f64;
     let mut at = last * random.random_range(0.0..0.3);
     let mut places = Vec::with_capacity(frame_count);
 
     while places.len() < frame_count {
-        let frames = random.random_range(STRETCH[0]..STRETCH[1]);
+        let frames = random.random_range(way.stretch[0]..way.stretch[1]);
         let pace = random.random_range(PACE[0]..PACE[1]);
-        let step = if random.random_bool(BACKWARD) {
+        let step = if random.random_bool(way.backward) {
             -pace
         } else {
             pace
@@ -237,11 +342,18 @@ fn places_on(length: usize, frame_count: usize, random: &mut ChaCha8Rng) -> Vec<
     places.truncate(frame_count);
 
     // A mean of neighbors rounds off the changes of speed, and stays on the path.
-    (0..frame_count)
+    let places: Vec<SVector<f64, 1>> = places.into_iter().map(SVector::<f64, 1>::new).collect();
+    let rounded = averaged(&places, SMOOTHED);
+    rounded.into_iter().map(|place| place[0]).collect()
+}
+
+/// The mean of each value and up to `reach` neighbors on each side.
+fn averaged<const N: usize>(values: &[SVector<f64, N>], reach: usize) -> Vec<SVector<f64, N>> {
+    (0..values.len())
         .map(|frame| {
-            let end = (frame + SMOOTHED + 1).min(frame_count);
-            let near = &places[frame.saturating_sub(SMOOTHED)..end];
-            near.iter().sum::<f64>() / near.len() as f64
+            let end = (frame + reach + 1).min(values.len());
+            let near = &values[frame.saturating_sub(reach)..end];
+            near.iter().sum::<SVector<f64, N>>() / near.len() as f64
         })
         .collect()
 }
@@ -278,15 +390,15 @@ fn deviation<const N: usize>(random: &mut ChaCha8Rng) -> SVector<f64, N> {
 }
 
 /// `frame_count` values that move from goal to goal in strokes of mean speed `speed`, per second,
-/// with a rest of up to `rest` seconds at each goal.
+/// with a rest at each goal.
 ///
 /// A stroke has minimum jerk: after the fraction τ of its time, it has covered 10 τ³ − 15 τ⁴ + 6 τ⁵
-/// of its length (Flash and Hogan 1985). The nominal duration is at least 0.5 s, varied by −20 % to
-/// +25 %.
+/// of its length (Flash and Hogan 1985). The nominal duration is varied by −20 % to +25 %. A moving
+/// average, applied twice, joins strokes that flow into each other.
 fn strokes<const N: usize>(
     frame_count: usize,
     speed: f64,
-    rest: f64,
+    pauses: Pauses,
     random: &mut ChaCha8Rng,
     mut goal: impl FnMut(Option<SVector<f64, N>>, &mut ChaCha8Rng) -> SVector<f64, N>,
 ) -> Vec<SVector<f64, N>> {
@@ -295,7 +407,8 @@ fn strokes<const N: usize>(
 
     while values.len() < frame_count {
         let to = goal(Some(from), random);
-        let seconds = ((to - from).norm() / speed).max(0.5) * random.random_range(0.8..1.25);
+        let seconds =
+            ((to - from).norm() / speed).max(pauses.shortest) * random.random_range(0.8..1.25);
         let frames = (seconds * FRAMES_PER_SECOND).ceil();
         values.extend((0..frames as usize).map(|frame| {
             let share = frame as f64 / frames;
@@ -303,13 +416,15 @@ fn strokes<const N: usize>(
             from + (to - from) * done
         }));
 
-        let rest = (random.random_range(0.0..1.0) * rest * FRAMES_PER_SECOND) as usize;
+        let rest = random.random_range(0.0..1.0) * pauses.rest;
+        let rest = (rest * FRAMES_PER_SECOND) as usize;
         values.extend(std::iter::repeat_n(to, rest));
         from = to;
     }
 
     values.truncate(frame_count);
-    values
+    let reach = (0.5 * pauses.flow * FRAMES_PER_SECOND) as usize;
+    averaged(&averaged(&values, reach), reach)
 }
 
 /// Hand tremor along one axis: three oscillations of about 0.7, 2 and 6 Hz.
@@ -349,7 +464,7 @@ mod tests {
     fn a_stroke_goes_from_goal_to_goal_and_rests_there() {
         let mut random = ChaCha8Rng::seed_from_u64(3);
         let mut goals = [0.0, 1.0].into_iter().cycle();
-        let values = strokes(300, 0.5, 0.0, &mut random, |_, _| {
+        let values = strokes(300, 0.5, Pauses::stops(0.0), &mut random, |_, _| {
             SVector::<f64, 1>::new(goals.next().unwrap())
         });
 

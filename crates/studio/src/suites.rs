@@ -24,6 +24,11 @@ pub enum Suite {
     /// looks elsewhere at times: about half of its views have a view of the first visit within
     /// 0.25 m and 15°.
     Returns,
+    /// The suite `returns`, but both visits are filmed in slow sweeps that flow into each other, as
+    /// for a 3D scan.
+    ///
+    /// The camera keeps its velocity for about a second, as in the kitchen of 7-Scenes.
+    Scans,
     /// One smooth walk per room, plain images: the hard class.
     ///
     /// The walk hardly covers what its last fifth sees.
@@ -36,6 +41,7 @@ impl Suite {
         match self {
             Self::Visits => visits::film(seed, number, frame_count, SecondVisit::Independent),
             Self::Returns => visits::film(seed, number, frame_count, SecondVisit::Returning),
+            Self::Scans => visits::film(seed, number, frame_count, SecondVisit::Sweeping),
             Self::Walks => {
                 let room = SuiteRoom::new(seed, number);
                 let poses = room.path(frame_count);

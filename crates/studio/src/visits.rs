@@ -6,7 +6,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::film::{Film, PasserBy, Visit};
-use super::hand_held::{Goals, Habit, HandPath};
+use super::hand_held::{Goals, Habit, HandPath, Return};
 use super::photograph::Shot;
 use super::solid::Solid;
 use super::suite::{decorate, room_size};
@@ -39,6 +39,8 @@ pub(super) enum SecondVisit {
     Independent,
     /// Along the path of the first visit for the most part.
     Returning,
+    /// Along the path of the first visit, and both in slow sweeps.
+    Sweeping,
 }
 
 /// The recording of room `number` of the suite with `seed`. On average, of twenty rooms nine are
@@ -75,19 +77,32 @@ pub(super) fn film(seed: u64, number: u32, frame_count: usize, second: SecondVis
 
         let path = goals.path(frames, &mut random);
         let own_poses = path.poses(&mut random);
-        let followed = match second {
-            SecondVisit::Independent => None,
-            SecondVisit::Returning => first_path.as_ref().filter(|path| !path.is_empty()),
+        // A stream of its own, so that what is drawn next does not depend on the path.
+        let own_stream = |stream: u64| {
+            let mut random = ChaCha8Rng::seed_from_u64(seed);
+            random.set_stream((stream << 32) + u64::from(number));
+            random
         };
-        poses.extend(match followed {
-            None => own_poses,
-            Some(first) => {
-                // A stream of its own, so that what is drawn next does not depend on the path.
-                let mut random = ChaCha8Rng::seed_from_u64(seed);
-                random.set_stream((2 << 32) + u64::from(number));
-                let path = first.followed(frames, walkable(size), &mut random);
-                path.poses(&mut random)
+        let follow = |first: &HandPath, way: &Return, random: &mut ChaCha8Rng| {
+            let path = first.followed(frames, walkable(size), way, random);
+            path.poses(random)
+        };
+        let first = first_path.as_ref().filter(|path| !path.is_empty());
+        poses.extend(match (second, first) {
+            (SecondVisit::Returning, Some(first)) => {
+                follow(first, &Return::RESTLESS, &mut own_stream(2))
             }
+            (SecondVisit::Sweeping, Some(first)) => {
+                follow(first, &Return::SWEEPING, &mut own_stream(4))
+            }
+            (SecondVisit::Sweeping, None) => {
+                let mut random = own_stream(3);
+                let path = goals.filmed(Habit::sweeping).path(frames, &mut random);
+                let poses = path.poses(&mut random);
+                first_path = Some(path);
+                poses
+            }
+            _ => own_poses,
         });
         first_path.get_or_insert(path);
 
@@ -102,6 +117,9 @@ pub(super) fn film(seed: u64, number: u32, frame_count: usize, second: SecondVis
         (SecondVisit::Returning, Tour::Part) => "returning part",
         (SecondVisit::Returning, Tour::Room) => "returning room",
         (SecondVisit::Returning, Tour::Corridor) => "returning corridor",
+        (SecondVisit::Sweeping, Tour::Part) => "scanned part",
+        (SecondVisit::Sweeping, Tour::Room) => "scanned room",
+        (SecondVisit::Sweeping, Tour::Corridor) => "scanned corridor",
     };
 
     Film {
@@ -194,6 +212,8 @@ fn habit(tour: Tour, size: Vector3<f64>, random: &mut ChaCha8Rng) -> Habit {
         speed,
         turning: turning.to_radians(),
         rest: random.random_range(0.3..1.2),
+        shortest: 0.5,
+        flow: 0.0,
     }
 }
 
@@ -342,11 +362,12 @@ mod tests {
     use seese3_core::geometry::Pose;
 
     const BOTH: [SecondVisit; 2] = [SecondVisit::Independent, SecondVisit::Returning];
+    const ALL: [SecondVisit; 3] = [BOTH[0], BOTH[1], SecondVisit::Sweeping];
 
     /// Oracle: geometry. A camera keeps 20 cm from the walls and 5 cm from every box.
     #[test]
     fn the_camera_keeps_clear_of_walls_and_furniture() {
-        for (number, second) in (0..60).flat_map(|number| BOTH.map(|second| (number, second))) {
+        for (number, second) in (0..60).flat_map(|number| ALL.map(|second| (number, second))) {
             let film = film(7, number, 400, second);
             for (frame, pose) in film.poses.iter().enumerate() {
                 let scene = &film.scenes[usize::from(frame >= 200)];

@@ -11,7 +11,7 @@ use seese3_core::training::{RoomData, TrainingPlan};
 use super::Error;
 use super::folds::FoldedMotions;
 use crate::formulations::read_by_adapter;
-use crate::probes::{Duplicates, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe};
+use crate::probes::{MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe};
 
 /// Settings of a row, besides its room and features.
 #[derive(Debug, Clone)]
@@ -67,7 +67,7 @@ pub struct LayerDimension {
     pub twonn: f64,
     /// Intrinsic dimension by maximum likelihood.
     pub mle: f64,
-    /// Number of duplicate rows dropped.
+    /// Number of rows left out as copies of an earlier row.
     pub dropped_rows: usize,
 }
 
@@ -103,7 +103,7 @@ pub fn score_layer(data: &RoomData<'_>, protocol: &LayerProtocol) -> Result<Laye
     let plan = &protocol.plan;
 
     let m1 = mutual_knn(rows, room.poses(), &protocol.mutual_knn)?;
-    let m2 = intrinsic_dimension(rows, protocol.gap, Duplicates::DropRows)?;
+    let m2 = intrinsic_dimension(rows, protocol.gap)?;
 
     let splits = &protocol.splits;
     let ridge = FoldedMotions::of(splits, |split| {

@@ -17,9 +17,7 @@ use super::folds::{FoldedBaselines, FoldedMotions};
 use super::{Error, Within};
 use crate::formulations::read_by_adapter;
 use crate::json::{self, PartsJson};
-use crate::probes::{
-    Duplicates, IntrinsicDimension, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe,
-};
+use crate::probes::{IntrinsicDimension, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe};
 
 /// Which scores are computed; `None` or an empty list skips a score.
 #[derive(Debug, Clone)]
@@ -44,8 +42,6 @@ pub struct ProbeProtocol {
 pub struct DimensionProtocol {
     /// Frames before and after each frame that are excluded as neighbors.
     pub gap: usize,
-    /// How duplicate rows are handled.
-    pub duplicates: Duplicates,
 }
 
 /// Scores at one stride.
@@ -177,7 +173,7 @@ pub struct ProbeScores {
 impl Serialize for DimensionScore {
     fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
         let dimension = &self.dimension;
-        let mut record = to.serialize_struct("DimensionScore", 10)?;
+        let mut record = to.serialize_struct("DimensionScore", 9)?;
         record.serialize_field("twonn", &dimension.two_nn.linear)?;
         record.serialize_field("mle", &dimension.mle_biased.harmonic)?;
         record.serialize_field("twonn_censored", &dimension.two_nn.censored)?;
@@ -185,7 +181,6 @@ impl Serialize for DimensionScore {
         record.serialize_field("mle_biased", &dimension.mle_biased)?;
         record.serialize_field("mle_unbiased", &dimension.mle_unbiased)?;
         record.serialize_field("gap", &self.protocol.gap)?;
-        record.serialize_field("duplicates", &self.protocol.duplicates)?;
         record.serialize_field("used_rows", &dimension.used)?;
         record.serialize_field("dropped_rows", &dimension.dropped)?;
         record.end()
@@ -221,8 +216,7 @@ pub fn probe(data: &RoomData<'_>, protocol: &ProbeProtocol) -> Result<ProbeScore
 
     let mut m2 = None;
     if let Some(protocol) = protocol.m2 {
-        let dimension = intrinsic_dimension(rows, protocol.gap, protocol.duplicates)
-            .within(|| "M2".to_owned())?;
+        let dimension = intrinsic_dimension(rows, protocol.gap).within(|| "M2".to_owned())?;
         m2 = Some(DimensionScore {
             dimension,
             protocol,

@@ -3,6 +3,8 @@
 //! Distances are computed directly, in f64. The expansion ‖x‖² − 2xy + ‖y‖² cancels for near
 //! duplicate rows and yields meaningless dimensions.
 
+use std::collections::HashSet;
+
 use ndarray::{ArrayView2, Axis};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -14,17 +16,6 @@ use seese3_core::statistics::{mean, median};
 const MLE_NEIGHBORS: usize = 20;
 /// Fraction of the largest ratios that TwoNN discards.
 const DISCARDED: f64 = 0.1;
-
-/// How identical rows are handled.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-pub enum Duplicates {
-    /// A row at distance zero from its nearest neighbor is dropped, as in scikit-dimension.
-    #[serde(rename = "dropped")]
-    DropRows,
-    /// The first of each group of identical rows is kept.
-    #[serde(rename = "first kept")]
-    KeepFirst,
-}
 
 /// TwoNN (Facco et al. 2017), estimated in three ways.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -61,49 +52,49 @@ pub struct IntrinsicDimension {
     pub mle_unbiased: Mle,
     /// Number of rows used.
     pub used: usize,
-    /// Number of rows dropped as duplicates.
+    /// Number of rows left out as copies of an earlier row.
     pub dropped: usize,
 }
 
-/// The intrinsic dimension of `rows` (n, d). Rows at most `gap` apart do not count as neighbors; a
-/// `gap` of 0 excludes only the row itself.
+/// The intrinsic dimension of `rows` (n, d). Of identical rows, only the first is used, both as a
+/// point and as a neighbor: the estimators take distinct points of the manifold, and a copy would
+/// be a neighbor at distance zero. Rows at most `gap` apart do not count as neighbors; a `gap` of 0
+/// excludes only the row itself.
 ///
 /// # Errors
-/// [`Error::TooFewRows`] when fewer than 21 rows are left without duplicates;
-/// [`Error::TooFewCandidates`] when the gap leaves a row fewer than 20 candidates.
+/// [`Error::TooFewRows`] when fewer than 21 distinct rows are left; [`Error::TooFewCandidates`]
+/// when the gap leaves a row fewer than 20 candidates.
 ///
-/// Source: SeeSE3, M2; the paper states neither gap nor K.
+/// Source: SeeSE3, M2; the paper states neither gap nor K, nor what it does with identical rows.
 pub fn intrinsic_dimension(
     rows: ArrayView2<'_, f32>,
     gap: usize,
-    duplicates: Duplicates,
 ) -> Result<IntrinsicDimension, Error> {
     let all = rows.mapv(f64::from);
-    let kept: Vec<usize> = match duplicates {
-        Duplicates::DropRows => (0..all.nrows()).collect(),
-        Duplicates::KeepFirst => {
-            let mut seen = std::collections::HashSet::new();
 
-            // Compare rows by bits. Adding 0.0 turns −0.0 into 0.0, so equal numbers have equal
-            // bits.
-            let bits = |row: usize| {
-                all.row(row)
-                    .iter()
-                    .map(|x| (x + 0.0).to_bits())
-                    .collect::<Vec<_>>()
-            };
-
-            (0..all.nrows())
-                .filter(|&row| seen.insert(bits(row)))
-                .collect()
-        }
+    // Compare rows by bits. Adding 0.0 turns −0.0 into 0.0, so equal numbers have equal bits.
+    let bits = |row: usize| -> Vec<u64> {
+        let numbers = all.row(row);
+        numbers.iter().map(|x| (x + 0.0).to_bits()).collect()
     };
+    let mut seen = HashSet::new();
+    let kept: Vec<usize> = (0..all.nrows())
+        .filter(|&row| seen.insert(bits(row)))
+        .collect();
+
+    if kept.len() <= MLE_NEIGHBORS {
+        return Err(Error::TooFewRows {
+            kept: kept.len(),
+            rows: all.nrows(),
+            needed: MLE_NEIGHBORS + 1,
+        });
+    }
 
     let points = all.select(Axis(0), &kept);
     let nearest = |row: usize| -> Result<Vec<f64>, Error> {
         let here = points.row(row);
         let mut squares: Vec<f64> = (0..points.nrows())
-            .filter(|&other| other != row && other.abs_diff(row) > gap)
+            .filter(|&other| kept[other].abs_diff(kept[row]) > gap)
             .map(|other| {
                 here.iter()
                     .zip(points.row(other))
@@ -133,27 +124,16 @@ pub fn intrinsic_dimension(
         .map(nearest)
         .collect::<Result<_, _>>()?;
 
-    // Drop rows at distance zero to another row: the estimators divide by the nearest distance.
-    let usable: Vec<&Vec<f64>> = distances.iter().filter(|row| row[0] > 0.0).collect();
-
-    if usable.len() <= MLE_NEIGHBORS {
-        return Err(Error::TooFewRows {
-            kept: usable.len(),
-            rows: all.nrows(),
-            needed: MLE_NEIGHBORS + 1,
-        });
-    }
-
     Ok(IntrinsicDimension {
-        two_nn: two_nn(&usable),
-        mle_biased: mle(&usable, MLE_NEIGHBORS as f64 - 1.0),
-        mle_unbiased: mle(&usable, MLE_NEIGHBORS as f64 - 2.0),
-        used: usable.len(),
-        dropped: all.nrows() - usable.len(),
+        two_nn: two_nn(&distances),
+        mle_biased: mle(&distances, MLE_NEIGHBORS as f64 - 1.0),
+        mle_unbiased: mle(&distances, MLE_NEIGHBORS as f64 - 2.0),
+        used: kept.len(),
+        dropped: all.nrows() - kept.len(),
     })
 }
 
-fn two_nn(distances: &[&Vec<f64>]) -> TwoNn {
+fn two_nn(distances: &[Vec<f64>]) -> TwoNn {
     // log μ of each row; μ is the ratio of the distances to its second and first neighbor.
     let mut logs: Vec<f64> = distances.iter().map(|row| (row[1] / row[0]).ln()).collect();
     logs.sort_by(f64::total_cmp);
@@ -185,9 +165,9 @@ fn two_nn(distances: &[&Vec<f64>]) -> TwoNn {
     }
 }
 
-fn mle(distances: &[&Vec<f64>], factor: f64) -> Mle {
+fn mle(distances: &[Vec<f64>], factor: f64) -> Mle {
     // Estimate of one row: factor / Σ_j log(r_K / r_j).
-    let of = |row: &&Vec<f64>| {
+    let of = |row: &Vec<f64>| {
         factor
             / row
                 .iter()

@@ -5,7 +5,7 @@ mod intrinsic_dimension;
 mod mutual_knn;
 mod ridge_probe;
 
-pub use intrinsic_dimension::{Duplicates, IntrinsicDimension, Mle, TwoNn, intrinsic_dimension};
+pub use intrinsic_dimension::{IntrinsicDimension, Mle, TwoNn, intrinsic_dimension};
 pub use mutual_knn::{Counted, Limit, MutualKnn, feature_neighbors, mutual_knn, pose_neighbors};
 pub use ridge_probe::ridge_probe;
 

@@ -4,6 +4,7 @@
 //! are whole JSON files, or parts that no result has in this shape.
 
 mod adapter_sweep;
+mod benchmark;
 mod columns;
 mod cross_room;
 mod dot_plot;
@@ -29,6 +30,7 @@ mod training;
 pub use adapter_sweep::{
     configurations_table, difficulty_table, parts_table, success_table, sweep_parquet,
 };
+pub use benchmark::{benchmark_page, benchmark_table};
 pub use columns::{ParquetColumn, parquet_file};
 pub use cross_room::{
     CrossRoomJson, count_text, cross_room_json, cross_room_table, room_difference_text,

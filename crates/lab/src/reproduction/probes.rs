@@ -11,7 +11,7 @@ use super::claims::{Claim, Verdict, is_above_zero};
 use super::{Error, Found, Reproduction, paper};
 use crate::experiments::Within;
 use crate::experiments::folds::FoldedMotions;
-use crate::probes::{Duplicates, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe};
+use crate::probes::{MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe};
 use crate::report::{Axes, Figure, Section, Series, Table, fixed, room_difference_text};
 
 /// Maximum number of frames that M1 compares, as in the paper.
@@ -194,7 +194,7 @@ fn probed(
     };
 
     // M2 without a temporal gap, as in the paper; `sweep layers` uses a gap by default.
-    let dimension = intrinsic_dimension(rows, 0, Duplicates::DropRows).within(what)?;
+    let dimension = intrinsic_dimension(rows, 0).within(what)?;
     let ridge = FoldedMotions::of(&Split::FOLDS, |split| {
         Ok(vec![ridge_probe(rows, room, split, given.options.stride)?])
     })

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use super::feature_map::pose_near;
 use super::{Bound, Check, ConstructedMap, DrawnMap, Effort, FeatureMap};
-use crate::probes::{self, Duplicates, IntrinsicDimension, intrinsic_dimension};
+use crate::probes::{self, IntrinsicDimension, intrinsic_dimension};
 use seese3_core::geometry::{Pose, Twist, exp};
 
 /// Width of the constructed features.
@@ -100,5 +100,5 @@ fn dimension(map: &dyn FeatureMap, poses: &[Pose]) -> Result<IntrinsicDimension,
     let columns = rows.first().map_or(0, Vec::len);
     let features = Array2::from_shape_fn((rows.len(), columns), |(row, column)| rows[row][column]);
 
-    intrinsic_dimension(features.view(), 0, Duplicates::DropRows)
+    intrinsic_dimension(features.view(), 0)
 }

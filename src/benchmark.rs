@@ -1,0 +1,286 @@
+//! `seese3 benchmark`: freezes rooms and pairs, answers them, and scores what others retrieve.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use anyhow::{Context, bail, ensure};
+use clap::{Args, Subcommand};
+
+use super::evaluate::navigators_named;
+use super::named::one_of;
+use super::output::{JsonOutput, check_writable, say, write_json, write_result};
+use super::progress::bar;
+use super::rooms::room_names;
+use crate::table_files::TableFiles;
+use seese3_core::cancel::Cancellation;
+use seese3_core::eval::{Protocol, evaluate};
+use seese3_core::geometry::Pose;
+use seese3_core::navigation::{IndexKind, Navigator};
+use seese3_core::splits::{Pair, Split};
+use seese3_lab::benchmark::{Benchmark, Submission, score};
+use seese3_lab::report::{benchmark_page, benchmark_table};
+use seese3_store::Store;
+
+/// Freeze rooms and pairs as a benchmark, and score submissions of retrieved frames
+#[derive(Debug, Args)]
+pub struct BenchmarkCommand {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, Subcommand)]
+enum What {
+    /// Write the test pairs of rooms to a file, with the SHA-256 of their poses
+    Freeze(Freeze),
+    /// Write what a stored adapter retrieves for a benchmark as a submission
+    Answer(Answer),
+    /// Check submissions against a benchmark, without its rooms
+    Check(Check),
+    /// Score submissions: Hit@ε over rooms beside standing still, with intervals
+    Score(Score),
+}
+
+#[derive(Debug, Args)]
+struct Freeze {
+    /// The store
+    #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
+    store: String,
+    /// The rooms: names, or patterns with *
+    #[arg(long = "room", required = true)]
+    rooms: Vec<String>,
+    /// Split that defines the test pairs and the candidate frames
+    #[arg(long, value_parser = one_of::<Split>(), default_value = "whole")]
+    split: Split,
+    /// Frames from the source to the target of a pair
+    #[arg(long, default_value_t = 25, value_parser = clap::value_parser!(u32).range(1..))]
+    stride: u32,
+    /// Name of the benchmark
+    #[arg(long)]
+    name: String,
+    /// The benchmark file to write
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+}
+
+#[derive(Debug, Args)]
+struct Answer {
+    /// The benchmark file
+    #[arg(long, value_name = "FILE")]
+    benchmark: PathBuf,
+    /// The store with its rooms and the adapter
+    #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
+    store: String,
+    /// The adapter
+    #[arg(long)]
+    adapter: String,
+    /// The navigator, a name of `evaluate`
+    #[arg(long, default_value = "inverse-poincare-affine")]
+    navigator: String,
+    /// Name of the method
+    #[arg(long)]
+    name: String,
+    /// One sentence: the features, what was trained on which rooms, the rule of retrieval
+    #[arg(long)]
+    about: String,
+    /// The submission file to write
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+}
+
+#[derive(Debug, Args)]
+struct Check {
+    /// The benchmark file
+    #[arg(long, value_name = "FILE")]
+    benchmark: PathBuf,
+    /// The submission files
+    #[arg(value_name = "SUBMISSION", required = true)]
+    submissions: Vec<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+struct Score {
+    /// The benchmark file
+    #[arg(long, value_name = "FILE")]
+    benchmark: PathBuf,
+    /// The store with its rooms
+    #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
+    store: String,
+    /// The submission files
+    #[arg(value_name = "SUBMISSION", required = true)]
+    submissions: Vec<PathBuf>,
+    /// Also write a page of results to this Markdown file
+    #[arg(long, value_name = "FILE.md")]
+    page: Option<PathBuf>,
+    #[command(flatten)]
+    files: TableFiles,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+impl BenchmarkCommand {
+    pub async fn run(self) -> anyhow::Result<()> {
+        match self.what {
+            What::Freeze(freeze) => freeze.run().await,
+            What::Answer(answer) => answer.run().await,
+            What::Check(check) => check.run(),
+            What::Score(score) => score.run().await,
+        }
+    }
+}
+
+impl Freeze {
+    async fn run(self) -> anyhow::Result<()> {
+        check_writable(&self.out)?;
+        let store = Store::open(&self.store)?;
+        let mut rooms = Vec::new();
+        for name in room_names(&store, &self.rooms).await? {
+            rooms.push(store.load_room(&name, None).await?.room);
+        }
+
+        let benchmark = Benchmark::freeze(&self.name, &rooms, self.split, self.stride)?;
+        let pairs: usize = benchmark.rooms.iter().map(|room| room.pair_count()).sum();
+        say(format_args!(
+            "benchmark '{}': {} rooms, {pairs} pairs, SHA-256 {}",
+            self.name,
+            rooms.len(),
+            benchmark.sha256()
+        ));
+        write_json(&self.out, &benchmark.file())
+    }
+}
+
+impl Answer {
+    async fn run(self) -> anyhow::Result<()> {
+        check_writable(&self.out)?;
+        let benchmark = read_benchmark(&self.benchmark)?;
+        let store = Store::open(&self.store)?;
+        let adapter = store.load_adapter(&self.adapter, None).await?.adapter;
+        let navigators = navigators_named(std::slice::from_ref(&self.navigator))?;
+        let protocol = Protocol {
+            split: benchmark.split()?,
+            navigators,
+            ..Protocol::paper(benchmark.stride)
+        };
+
+        let progress = bar(benchmark.rooms.len() as u64, "rooms");
+        let mut frames = Vec::new();
+        for frozen in &benchmark.rooms {
+            let features = Some(adapter.source().name.as_str());
+            let (stored, features) = store.load_room_with(&frozen.room, features).await?;
+            frozen.check_poses(stored.room.poses())?;
+
+            let navigator = Navigator::new(
+                Arc::new(stored.room),
+                &features,
+                adapter.clone(),
+                IndexKind::Exact,
+            )?;
+            let cancel = Cancellation::default();
+            let report = evaluate(&navigator, &protocol, &cancel, &mut |_, _| ())?;
+            let scored = &report.rows[0].retrieval.pairs;
+            let pairs: Vec<Pair> = scored.iter().map(|scored| scored.pair).collect();
+            ensure!(
+                pairs == frozen.pairs(benchmark.stride),
+                "room '{}': this version makes other pairs of the split '{}' than the benchmark has",
+                frozen.room,
+                benchmark.split
+            );
+            frames.push(scored.iter().map(|scored| scored.retrieved.0).collect());
+            progress.inc(1);
+        }
+        progress.finish_and_clear();
+
+        let submission = benchmark.submission(&self.name, &self.about, frames);
+        write_json(&self.out, &submission)?;
+        say(format_args!("wrote {}", self.out.display()));
+        Ok(())
+    }
+}
+
+impl Check {
+    fn run(self) -> anyhow::Result<()> {
+        let benchmark = read_benchmark(&self.benchmark)?;
+        for file in &self.submissions {
+            let submission = read_submission(file, &benchmark)?;
+            say(format_args!(
+                "{}: '{}' is valid",
+                file.display(),
+                submission.name
+            ));
+        }
+        Ok(())
+    }
+}
+
+impl Score {
+    async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+        self.files.begin()?;
+        if let Some(page) = &self.page {
+            check_writable(page)?;
+        }
+
+        let benchmark = read_benchmark(&self.benchmark)?;
+        let mut submissions = Vec::new();
+        for file in &self.submissions {
+            let submission = read_submission(file, &benchmark)?;
+            let is_same = |other: &Submission| other.name == submission.name;
+            if submissions.iter().any(is_same) {
+                bail!(
+                    "{}: the name '{}' is in two submissions",
+                    file.display(),
+                    submission.name
+                );
+            }
+            submissions.push(submission);
+        }
+
+        let store = Store::open(&self.store)?;
+        let mut rooms: Vec<Vec<Pose>> = Vec::new();
+        for frozen in &benchmark.rooms {
+            let stored = store.load_room(&frozen.room, None).await?;
+            frozen.check_poses(stored.room.poses())?;
+            rooms.push(stored.room.poses().to_vec());
+        }
+
+        let poses: Vec<&[Pose]> = rooms.iter().map(Vec::as_slice).collect();
+        // Standing still is always in the table.
+        let mut all = vec![benchmark.standing_still()];
+        all.extend(submissions);
+        let mut scores: Vec<_> = all
+            .iter()
+            .map(|submission| score(&benchmark, submission, &poses))
+            .collect();
+        let first = |index: usize, scores: &[seese3_lab::benchmark::BenchmarkScores]| {
+            scores[index].hits.first().map_or(0.0, |hits| hits.hit.mean)
+        };
+        let mut order: Vec<usize> = (0..scores.len()).collect();
+        order.sort_by(|&a, &b| first(b, &scores).total_cmp(&first(a, &scores)));
+        scores = order
+            .into_iter()
+            .map(|index| scores[index].clone())
+            .collect();
+
+        self.files.say(&benchmark_table(&scores), &benchmark.name)?;
+        if let Some(page) = &self.page {
+            write_result(page, benchmark_page(&benchmark, &scores).as_bytes())?;
+            say(format_args!("wrote {}", page.display()));
+        }
+        self.json.write(&serde_json::json!({
+            "benchmark": { "name": benchmark.name, "sha256": benchmark.sha256() },
+            "submissions": scores,
+        }))
+    }
+}
+
+fn read_benchmark(file: &std::path::Path) -> anyhow::Result<Benchmark> {
+    let place = file.display();
+    let bytes = std::fs::read(file).with_context(|| format!("{place} cannot be read"))?;
+    Benchmark::read(&bytes).with_context(|| format!("{place}"))
+}
+
+fn read_submission(file: &std::path::Path, benchmark: &Benchmark) -> anyhow::Result<Submission> {
+    let place = file.display();
+    let bytes = std::fs::read(file).with_context(|| format!("{place} cannot be read"))?;
+    Submission::read(&bytes, benchmark).with_context(|| format!("{place}"))
+}
