@@ -42,6 +42,7 @@ const HEADINGS: [(&str, &[&str]); 4] = [
             "sweep",
             "cross-room",
             "benchmark",
+            "card",
             "reproduce",
             "theory",
             "studio",

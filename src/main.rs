@@ -59,6 +59,8 @@ mod studio;
 #[cfg(feature = "lab")]
 mod benchmark;
 #[cfg(feature = "lab")]
+mod card;
+#[cfg(feature = "lab")]
 mod cross_room;
 
 use std::io::Write;
@@ -179,6 +181,9 @@ enum Command {
     /// by number of training rooms
     CrossRoom(cross_room::CrossRoom),
     #[cfg(feature = "lab")]
+    /// Describe recordings by statistics, to compare drawn rooms with real ones
+    Card(card::Card),
+    #[cfg(feature = "lab")]
     /// Freeze rooms and pairs as a benchmark, and score submissions of retrieved frames
     Benchmark(benchmark::BenchmarkCommand),
     #[cfg(feature = "lab")]
@@ -266,6 +271,8 @@ async fn dispatch(cli: Cli) -> anyhow::Result<()> {
         Command::Probe(arguments) => arguments.run().await,
         #[cfg(feature = "lab")]
         Command::CrossRoom(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
+        Command::Card(arguments) => arguments.run().await,
         #[cfg(feature = "lab")]
         Command::Benchmark(arguments) => arguments.run().await,
         #[cfg(feature = "lab")]

@@ -17,7 +17,7 @@ use seese3_core::training::{RoomData, TrainingPlan};
 use seese3_lab::experiments::probe::{
     DimensionProtocol, DimensionScore, ProbeProtocol, ProbeScores, probe, probe_adapters,
 };
-use seese3_lab::probes::{Counted, Limit, MutualKnn};
+use seese3_lab::probes::{Counted, Limit, MutualKnn, PoseDistance};
 use seese3_lab::report::{ProbeJson, ProbedRooms, probe_plot, probe_table};
 use seese3_store::StoredRoom;
 
@@ -69,10 +69,21 @@ pub struct Probe {
     /// M1: count a frame at exactly the distance --m1-exclusion as a neighbor
     #[arg(long)]
     m1_exclusive: bool,
+    /// M1: the distance between poses
+    #[arg(long, value_enum, default_value_t = PoseName::NineNumbers)]
+    m1_pose: PoseName,
     /// M2: frames to each side that do not count as neighbors. 0 measures the dimension of the
     /// camera path rather than that of the room
     #[arg(long, default_value_t = 10)]
     m2_gap: usize,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum PoseName {
+    /// Position and two columns of the rotation matrix, as in the paper
+    NineNumbers,
+    /// Norm of the twist from one pose to the other, meters and radians mixed
+    Twist,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -239,6 +250,10 @@ impl Probe {
                 Limit::Exclusive
             } else {
                 Limit::Inclusive
+            },
+            pose_distance: match self.m1_pose {
+                PoseName::NineNumbers => PoseDistance::NineNumbers,
+                PoseName::Twist => PoseDistance::Twist,
             },
         };
         let dimension = DimensionProtocol { gap: self.m2_gap };

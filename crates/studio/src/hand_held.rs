@@ -37,6 +37,8 @@ pub(super) struct Habit {
     pub shortest: f64,
     /// Width of the moving average that joins strokes, seconds; 0 to stop at every goal.
     pub flow: f64,
+    /// Whether the nearer of two random goals is chosen, as by a person who looks around.
+    pub stays_near: bool,
 }
 
 impl Habit {
@@ -46,15 +48,16 @@ impl Habit {
             speed: SWEEP_SPEED * self.speed,
             turning: SWEEP_TURNING * self.turning,
             rest: 0.0,
-            shortest: 2.0,
-            flow: 1.2,
+            shortest: 1.2,
+            flow: 1.0,
+            stays_near: false,
             ..self
         }
     }
 }
 
 /// Speed and rotation speed of sweeps, in those of strokes.
-const SWEEP_SPEED: f64 = 1.0;
+const SWEEP_SPEED: f64 = 1.2;
 const SWEEP_TURNING: f64 = 0.8;
 
 /// The standpoints and views in a room, shared by all visits.
@@ -113,7 +116,7 @@ impl Goals {
             habit.pauses(),
             random,
             |now, random| {
-                let goal = near_one(&self.standpoints, now, MISS[0], random);
+                let goal = self.next(&self.standpoints, now, MISS[0], random);
                 goal.zip_zip_map(&low, &high, |at, low, high| at.clamp(low, high))
             },
         );
@@ -122,7 +125,7 @@ impl Goals {
             habit.turning,
             habit.pauses(),
             random,
-            |now, random| near_one(&self.views, now, MISS[1], random),
+            |now, random| self.next(&self.views, now, MISS[1], random),
         );
         let rolls = strokes(frame_count, 0.1, habit.pauses(), random, |_, random| {
             habit.roll * deviation::<1>(random)
@@ -133,6 +136,20 @@ impl Goals {
             views,
             rolls,
         }
+    }
+}
+
+impl Goals {
+    /// The next goal, plus noise of standard deviation `miss`.
+    fn next<const N: usize>(
+        &self,
+        goals: &[SVector<f64, N>],
+        now: Option<SVector<f64, N>>,
+        miss: f64,
+        random: &mut ChaCha8Rng,
+    ) -> SVector<f64, N> {
+        let near = now.filter(|_| self.habit.stays_near);
+        near_one(goals, near, miss, random)
     }
 }
 
@@ -241,8 +258,6 @@ const TURN_RAD: f64 = 0.1;
 const ELSEWHERE_RAD: [f64; 2] = [0.4, 1.2];
 /// Share of the offsets, and of the views, that leave the followed path.
 const ASIDE: f64 = 0.2;
-/// Range of the speed along a followed path, in speeds of the first visit.
-const PACE: [f64; 2] = [0.5, 1.2];
 
 /// How a person follows an earlier path.
 #[derive(Debug, Clone)]
@@ -253,10 +268,12 @@ pub(super) struct Return {
     turn_speed: f64,
     /// Of the changes of offset and views.
     pauses: Pauses,
-    /// Range of the length of a stretch in one direction, frames.
-    stretch: [usize; 2],
+    /// Length of a stretch in one direction.
+    stretch: Stretch,
     /// Share of the stretches that are walked backward.
     backward: f64,
+    /// Range of the speed along a followed path, in speeds of the first visit.
+    pace: [f64; 2],
 }
 
 impl Return {
@@ -265,8 +282,9 @@ impl Return {
         beside_speed: 0.15,
         turn_speed: 0.3,
         pauses: Pauses::stops(1.0),
-        stretch: [60, 180],
+        stretch: Stretch::Frames([60, 180]),
         backward: 0.3,
+        pace: [0.5, 1.2],
     };
 
     /// Like a person who scans the room again.
@@ -278,9 +296,19 @@ impl Return {
             shortest: 2.0,
             flow: 1.2,
         },
-        stretch: [150, 450],
+        stretch: Stretch::Share([0.3, 0.9]),
         backward: 0.3,
+        pace: [0.7, 1.4],
     };
+}
+
+/// Range of the length of a stretch.
+#[derive(Debug, Clone, Copy)]
+enum Stretch {
+    /// In frames.
+    Frames([usize; 2]),
+    /// In lengths of the followed path.
+    Share([f64; 2]),
 }
 
 /// How strokes follow each other, seconds; as in [`Habit`].
@@ -323,8 +351,15 @@ fn places_on(length: usize, frame_count: usize, way: &Return, random: &mut ChaCh
     let mut places = Vec::with_capacity(frame_count);
 
     while places.len() < frame_count {
-        let frames = random.random_range(way.stretch[0]..way.stretch[1]);
-        let pace = random.random_range(PACE[0]..PACE[1]);
+        let drawn = match way.stretch {
+            Stretch::Frames([low, high]) => random.random_range(low..high) as f64,
+            Stretch::Share([low, high]) => last * random.random_range(low..high),
+        };
+        let pace = random.random_range(way.pace[0]..way.pace[1]);
+        let frames = match way.stretch {
+            Stretch::Frames(_) => drawn as usize,
+            Stretch::Share(_) => (drawn / pace) as usize + 1,
+        };
         let step = if random.random_bool(way.backward) {
             -pace
         } else {

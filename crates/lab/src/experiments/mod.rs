@@ -12,6 +12,7 @@
 //! - [`odometry_scenarios`]: parts without a map, kidnaps and wheels.
 //! - [`planning`]: paths to a goal, compared with simple planners.
 //! - [`robustness`]: a tracker under disturbances of its images.
+//! - [`room_card`]: statistics of recordings.
 //! - [`path_comparison`]: an estimated path compared with a reference.
 //!
 //! An experiment takes loaded rooms ([`seese3_core::training::RoomData`]); it reads and writes no
@@ -37,6 +38,7 @@ pub mod probe;
 pub mod replay;
 mod simulated_sensors;
 pub mod robustness;
+pub mod room_card;
 pub mod seeds;
 mod simple_planners;
 pub mod tracked_room;

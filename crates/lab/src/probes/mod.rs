@@ -6,7 +6,9 @@ mod mutual_knn;
 mod ridge_probe;
 
 pub use intrinsic_dimension::{IntrinsicDimension, Mle, TwoNn, intrinsic_dimension};
-pub use mutual_knn::{Counted, Limit, MutualKnn, feature_neighbors, mutual_knn, pose_neighbors};
+pub use mutual_knn::{
+    Counted, Limit, MutualKnn, PoseDistance, feature_neighbors, mutual_knn, pose_neighbors,
+};
 pub use ridge_probe::ridge_probe;
 
 use seese3_core::{ridge, splits};

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::Error;
-use seese3_core::geometry::Pose;
+use seese3_core::geometry::{Pose, body_twist};
 
 /// The options of M1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -26,6 +26,20 @@ pub struct MutualKnn {
     /// Whether a frame at exactly the distance `exclusion` is excluded too.
     #[serde(rename = "exclusion_is")]
     pub limit: Limit,
+    /// The distance between poses.
+    #[serde(rename = "pose")]
+    pub pose_distance: PoseDistance,
+}
+
+/// The distance between poses of M1.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum PoseDistance {
+    /// Euclidean over nine numbers in world coordinates: the position in meters and the first two
+    /// columns of the rotation matrix, as in the paper.
+    NineNumbers,
+    /// ‖log(P₁⁻¹ P₂)‖: the norm of the twist from one pose to the other, meters and radians mixed.
+    Twist,
 }
 
 /// The unit of a temporal distance.
@@ -75,6 +89,7 @@ impl Default for MutualKnn {
             exclusion: 10,
             counted: Counted::Sampled,
             limit: Limit::Inclusive,
+            pose_distance: PoseDistance::NineNumbers,
         }
     }
 }
@@ -138,8 +153,7 @@ pub fn feature_neighbors(
     neighbors(options, distance)
 }
 
-/// The k nearest neighbors of each sampled frame by pose, nearest first. The distance is Euclidean
-/// over (t, R[:, 0], R[:, 1]), mixing meters and unitless numbers.
+/// The k nearest neighbors of each sampled frame by pose, nearest first.
 ///
 /// # Errors
 /// As [`mutual_knn`].
@@ -151,11 +165,13 @@ pub fn pose_neighbors(poses: &[Pose], options: &MutualKnn) -> Result<Vec<Vec<usi
         let r = r.matrix();
         std::array::from_fn(|i| if i < 3 { t[i] } else { r[(i % 3, i / 3 - 1)] })
     };
-    let points: Vec<[f64; 9]> = sampled(poses.len(), options)?
-        .into_iter()
-        .map(nine)
-        .collect();
+    let sampled = sampled(poses.len(), options)?;
+    if options.pose_distance == PoseDistance::Twist {
+        let twist = |a: usize, b: usize| body_twist(&poses[sampled[a]], &poses[sampled[b]]);
+        return neighbors(options, |a, b| twist(a, b).to_vector().norm());
+    }
 
+    let points: Vec<[f64; 9]> = sampled.into_iter().map(nine).collect();
     let distance = |a: usize, b: usize| {
         points[a]
             .iter()
@@ -232,6 +248,29 @@ fn neighbors(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Oracle: by hand. Camera 1 is 1 m from camera 0, camera 2 is turned by 0.9 rad: the norm of the
+    /// twist is 1 and 0.9, and the nine numbers differ by 1 and by 2 sin(0.45) √2 = 1.23.
+    #[test]
+    fn the_nearest_pose_depends_on_the_distance() {
+        let poses = [
+            Pose::identity(),
+            Pose::translation(1.0, 0.0, 0.0),
+            Pose::rotation(nalgebra::Vector3::new(0.0, 0.0, 0.9)),
+        ];
+        let nearest = |pose_distance| {
+            let options = MutualKnn {
+                frames: 3,
+                k: 1,
+                exclusion: 0,
+                pose_distance,
+                ..MutualKnn::default()
+            };
+            pose_neighbors(&poses, &options).unwrap()[0][0]
+        };
+        assert_eq!(nearest(PoseDistance::NineNumbers), 1);
+        assert_eq!(nearest(PoseDistance::Twist), 2);
+    }
 
     /// Oracle: by hand, for two frames that are three samples, or six room frames, apart.
     #[test]
