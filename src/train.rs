@@ -13,7 +13,7 @@ use seese3_core::training::{
     RoomData, TrainingPlan, motions, relational_predictions, train_reader,
 };
 use seese3_lab::experiments::seeds::{SeededTraining, TrainingRun, train_seeds};
-use seese3_lab::report::{training_json, training_remark, training_table};
+use seese3_lab::report::{gating_text, training_json, training_remark, training_table};
 use seese3_robot::calibration::{calibrate, check_unseen};
 
 use super::output::{JsonOutput, say, say_published};
@@ -175,6 +175,10 @@ fn say_scores(runs: &[TrainingRun]) {
     say(training_table(runs));
     if let Some(remark) = training_remark(runs) {
         say(remark);
+    }
+
+    if let Some(text) = gating_text(runs) {
+        say(text);
     }
 
     // A motion component that is constant over the test pairs has no R².

@@ -251,6 +251,12 @@ impl<T: Real> Mixture<T> {
         }
     }
 
+    /// The temperature e^τ of the gate; `None` without a gate.
+    pub fn temperature(&self) -> Option<T> {
+        let [_, _, log_tau] = &self.gate.as_ref()?.tensors;
+        Some(log_tau[(0, 0)].exp())
+    }
+
     /// Number of charts, K.
     pub fn chart_count(&self) -> usize {
         self.charts.len()

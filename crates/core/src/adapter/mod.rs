@@ -45,7 +45,7 @@ pub use relational::{
 pub use samples::{Samples, column_scale};
 pub use siamese::{Siamese, TENSOR_NAMES};
 pub use train::{EpochProgress, StepReport, TrainConfig, Trainer, train, train_further};
-pub use trained::Adapter;
+pub use trained::{Adapter, Gating};
 pub use whitener::Whitener;
 
 /// Layers and training loop for the comparison networks of `seese3-lab`.

@@ -247,6 +247,20 @@ impl Adapter {
         Ok(matrix)
     }
 
+    /// How a gate mixes the charts for these features, shape (n, d), n > 0. `None` without a gate.
+    ///
+    /// # Errors
+    /// The errors of [`Adapter::embed`].
+    pub fn gating(&self, features: ArrayView2<'_, f32>) -> Result<Option<Gating>, Error> {
+        let Some(temperature) = self.network_f64.temperature() else {
+            return Ok(None);
+        };
+
+        let latents = self.embed(features)?;
+        let gates = latents.slice(s![.., self.coordinate_count()..]);
+        Ok(Some(Gating::of(temperature, gates)))
+    }
+
     /// Refuses features from a source that differs from the training source.
     ///
     /// # Errors
@@ -501,4 +515,58 @@ fn describe(source: &FeatureSource) -> String {
         "{name} (encoder {encoder}, layer {layer}, base {base}, norm {norm}, pooling {pooling}, \
          preprocess {preprocess}, {dim} columns)"
     )
+}
+
+/// How the gate of a mixture mixes its charts.
+///
+/// Source: SeeSE3, Sec. A.11: a gate whose weights stay equal has learned no charts.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+pub struct Gating {
+    /// The temperature e^τ of the softmax; 1 before training.
+    pub temperature: f64,
+    /// Mean entropy of a frame's gate weights, in that of equal weights: 1 for equal weights, 0 for
+    /// one chart per frame.
+    pub entropy: f64,
+    /// Mean gate weight of each chart.
+    pub mean_weights: Vec<f64>,
+    /// Entropy of the mean weights, in that of equal weights: 0 if all frames use one chart.
+    pub entropy_of_mean: f64,
+}
+
+impl Gating {
+    /// Of gate weights, shape (n, K), with n > 0 and K > 1.
+    fn of(temperature: f64, gates: ArrayView2<'_, f64>) -> Self {
+        let most = (gates.ncols() as f64).ln();
+        let entropy = |weights: ArrayView1<'_, f64>| {
+            let terms = weights.iter().filter(|weight| **weight > 0.0);
+            -terms.map(|weight| weight * weight.ln()).sum::<f64>() / most
+        };
+        let sum: f64 = gates.outer_iter().map(entropy).sum();
+        let count = gates.nrows() as f64;
+        let mean = gates.sum_axis(Axis(0)) / count;
+
+        Self {
+            temperature,
+            entropy: sum / count,
+            entropy_of_mean: entropy(mean.view()),
+            mean_weights: mean.to_vec(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: by hand. One frame uses one chart alone, the other both equally: the entropies 0 and
+    /// ln 2 have the mean ½ ln 2, and the mean weights are ¾ and ¼ with the entropy 0.8113 bits.
+    #[test]
+    fn the_entropy_of_a_gate_is_relative_to_equal_weights() {
+        let gates = ndarray::array![[1.0, 0.0], [0.5, 0.5]];
+        let found = Gating::of(1.0, gates.view());
+        assert!((found.entropy - 0.5).abs() < 1e-12);
+        assert_eq!(found.mean_weights, [0.75, 0.25]);
+        assert!((found.entropy_of_mean - 0.811_278).abs() < 1e-6);
+    }
 }

@@ -3,9 +3,10 @@
 use std::sync::Arc;
 use std::time::Instant;
 
+use ndarray::{Axis, concatenate};
 use rayon::prelude::*;
 
-use seese3_core::adapter::{Adapter, EpochProgress, Reading, TrainingRecord};
+use seese3_core::adapter::{Adapter, EpochProgress, Gating, Reading, TrainingRecord};
 use seese3_core::cancel::Cancellation;
 use seese3_core::eval::{Protocol, evaluate};
 use seese3_core::navigation::{
@@ -25,6 +26,8 @@ pub struct TrainingRun {
     pub hit_rate: Rate,
     /// Wall time of training alone, seconds.
     pub seconds: f64,
+    /// How a gate mixes the charts, over all frames of the rooms; `None` without a gate.
+    pub gating: Option<Gating>,
 }
 
 /// The adapter of the first seed, and the scores of every seed.
@@ -63,6 +66,7 @@ pub fn train_seeds(
             record,
             hit_rate,
             seconds,
+            gating: gating(rooms, &adapter)?,
         };
         Ok((adapter, run))
     };
@@ -78,6 +82,15 @@ pub fn train_seeds(
         .ok_or_else(|| Error::Input("at least one seed is required".to_owned()))?;
 
     Ok(SeededTraining { adapter, runs })
+}
+
+/// How the adapter's gate mixes its charts over the frames of all rooms; `None` without a gate.
+fn gating(rooms: &[RoomData<'_>], adapter: &Adapter) -> Result<Option<Gating>, Error> {
+    let rows: Vec<_> = rooms.iter().map(|data| data.features.rows()).collect();
+    let Ok(rows) = concatenate(Axis(0), &rows) else {
+        return Ok(None);
+    };
+    Ok(adapter.gating(rows.view())?)
 }
 
 /// Hit@0.1 of inverse Poincaré with the affine reading, over the test pairs of all rooms together.

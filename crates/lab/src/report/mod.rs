@@ -69,7 +69,7 @@ pub use robustness::{RobustnessJson, robustness_json, robustness_table};
 pub use room_card::{medians as medians_of_cards, room_card_table};
 pub use table::{Column, Table, fixed};
 pub use theory::{TheoryJson, theory_json, theory_plot, theory_table};
-pub use training::{TrainingJson, training_json, training_remark, training_table};
+pub use training::{TrainingJson, gating_text, training_json, training_remark, training_table};
 
 /// Why a result could not be rendered.
 #[derive(Debug, thiserror::Error)]

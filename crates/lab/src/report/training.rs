@@ -81,6 +81,22 @@ pub fn training_remark(runs: &[TrainingRun]) -> Option<String> {
     ))
 }
 
+/// How the gate of the first run mixes its charts, as text; `None` without a gate.
+pub fn gating_text(runs: &[TrainingRun]) -> Option<String> {
+    let gating = runs.first()?.gating.as_ref()?;
+    let weights: Vec<String> = gating
+        .mean_weights
+        .iter()
+        .map(|weight| format!("{weight:.2}"))
+        .collect();
+    Some(format!(
+        "gate: temperature {:.2}, mean entropy of a frame's weights {:.2} (equal weights 1, one chart 0), mean weights {}",
+        gating.temperature,
+        gating.entropy,
+        weights.join(", ")
+    ))
+}
+
 /// Formats a score. An undefined score, as of a test without pairs, is a dash.
 fn number_text(value: f64) -> String {
     if value.is_finite() {
@@ -136,11 +152,12 @@ impl Serialize for RunJson<'_> {
             record: training,
             hit_rate,
             seconds,
+            gating,
         } = self.0;
         let rooms: Vec<MotionJson> = training.room_tests.iter().map(MotionJson::from).collect();
         let hit = BTreeMap::from([("hit", BTreeMap::from([("0.1", hit_rate)]))]);
 
-        let mut record = to.serialize_struct("Run", 7)?;
+        let mut record = to.serialize_struct("Run", 8)?;
         record.serialize_field("seed", &training.config.seed)?;
         record.serialize_field("test", &MotionJson::from(&training.test))?;
         record.serialize_field("train", &MotionJson::from(&training.train))?;
@@ -149,6 +166,7 @@ impl Serialize for RunJson<'_> {
         record.serialize_field("rooms", &rooms)?;
         record.serialize_field("inverse_poincare_affine", &hit)?;
         record.serialize_field("seconds", seconds)?;
+        record.serialize_field("gating", gating)?;
         record.end()
     }
 }
