@@ -1,5 +1,7 @@
 //! Statistics of recordings, so that drawn rooms can be compared with real ones.
 
+use std::ops::Range;
+
 use ndarray::{Array2, ArrayView1, ArrayView2, Axis, s};
 use serde::Serialize;
 
@@ -69,91 +71,103 @@ impl RoomCard {
     /// The statistics of a room with its features.
     pub fn of(data: &RoomData<'_>) -> Self {
         let room = data.room;
-        let visits = visits(room);
         let poses = room.poses();
-        let rows = data.features.rows();
-        let within = |lag: usize| {
-            let starts = |visit: &std::ops::Range<usize>| {
-                visit.start..visit.end.saturating_sub(lag).max(visit.start)
-            };
-            visits.iter().flat_map(starts).collect::<Vec<usize>>()
+        let recording = Recording {
+            poses,
+            visits: visits(room),
         };
+        let rows = data.features.rows();
+        let scaled = standardized(rows);
 
-        let steps: Vec<PoseError> = within(STEP)
-            .into_iter()
+        let steps: Vec<PoseError> = recording
+            .starts(STEP)
             .map(|row| PoseError::between(&poses[row], &poses[row + STEP]))
             .collect();
         let column = |of: fn(&PoseError) -> f64| median(&steps.iter().map(of).collect::<Vec<_>>());
-        let lags = [1, 10, STEP];
-        let persistence = |of: fn(&Pose, &Pose) -> Vector3<f64>| {
-            lags.map(|lag| {
-                let velocity = |row: usize| of(&poses[row], &poses[row + 1]);
-                let pairs = within(lag + 1);
-                let pairs = pairs
-                    .into_iter()
-                    .map(|row| [velocity(row), velocity(row + lag)]);
-                autocorrelation(pairs)
-            })
-        };
-
-        let later = visits.get(1..).unwrap_or_default();
-        let across = |nearest: &dyn Fn(usize, usize) -> usize| {
-            let found = later
-                .iter()
-                .flat_map(|visit| visit.clone().map(|row| (row, nearest(row, visit.start))));
-            MedianError::of(found, poses)
-        };
-        let scaled = standardized(rows);
+        let windows = windows(&recording.visits);
+        let ratios: Vec<f64> = windows
+            .map(|window| participation_ratio(rows.slice(s![window, ..])))
+            .collect();
+        let changes: Vec<f64> = recording
+            .starts(1)
+            .map(|row| squared_distance(scaled.row(row), scaled.row(row + 1)))
+            .collect();
 
         Self {
             room: room.id().to_string(),
             format: room.provenance().format.clone(),
             frames: poses.len(),
-            visits: visits.len(),
+            visits: recording.visits.len(),
             step_m: column(|step| step.translation_m),
             step_deg: column(|step| step.rotation_rad.to_degrees()),
-            persistence_v: persistence(|a, b| body_twist(a, b).linear),
-            persistence_w: persistence(|a, b| body_twist(a, b).angular),
-            revisited: share(visits.iter().flat_map(|visit| {
-                let has_revisit = |row: usize| {
-                    let mut others = visit.clone().filter(|other| other.abs_diff(row) > APART);
-                    others.any(|other| is_near(&poses[row], &poses[other]))
-                };
-                visit.clone().map(has_revisit)
-            })),
-            overlap: (!later.is_empty()).then(|| {
-                share(later.iter().flat_map(|visit| {
-                    let start = visit.start;
-                    let meets = move |row: usize| {
-                        (0..start).any(|other| is_near(&poses[row], &poses[other]))
-                    };
-                    visit.clone().map(meets)
-                }))
+            persistence_v: recording.persistence(|a, b| body_twist(a, b).linear),
+            persistence_w: recording.persistence(|a, b| body_twist(a, b).angular),
+            revisited: recording.revisited(),
+            overlap: recording.overlap(),
+            across_by_feature: recording
+                .across(|row, other| squared_distance(scaled.row(row), scaled.row(other))),
+            across_by_pose: recording.across(|row, other| {
+                let error = PoseError::between(&poses[row], &poses[other]);
+                error.translation_m + error.rotation_rad
             }),
-            across_by_feature: across(&|row, earlier| {
-                let distance = |other: usize| squared_distance(scaled.row(row), scaled.row(other));
-                least(earlier, distance)
-            }),
-            across_by_pose: across(&|row, earlier| {
-                let distance = |other: usize| {
-                    let error = PoseError::between(&poses[row], &poses[other]);
-                    error.translation_m + error.rotation_rad
-                };
-                least(earlier, distance)
-            }),
-            participation_ratio: mean(
-                &windows(&visits)
-                    .map(|window| participation_ratio(rows.slice(s![window, ..])))
-                    .collect::<Vec<_>>(),
-            ),
-            feature_step: {
-                let changes: Vec<f64> = within(1)
-                    .into_iter()
-                    .map(|row| squared_distance(scaled.row(row), scaled.row(row + 1)))
-                    .collect();
-                (mean(&changes) / rows.ncols() as f64).sqrt()
-            },
+            participation_ratio: mean(&ratios),
+            feature_step: (mean(&changes) / rows.ncols() as f64).sqrt(),
         }
+    }
+}
+
+/// The poses of a recording and the rows of its visits.
+struct Recording<'a> {
+    poses: &'a [Pose],
+    visits: Vec<Range<usize>>,
+}
+
+impl Recording<'_> {
+    /// The rows that have another row of the same visit `lag` frames later.
+    fn starts(&self, lag: usize) -> impl Iterator<Item = usize> {
+        let of_visit = move |visit: &Range<usize>| visit.start..visit.end.saturating_sub(lag);
+        self.visits.iter().flat_map(of_visit)
+    }
+
+    /// Autocorrelation of a velocity after 1, 10 and 20 frames.
+    fn persistence(&self, velocity: fn(&Pose, &Pose) -> Vector3<f64>) -> [f64; 3] {
+        let at = |row: usize| velocity(&self.poses[row], &self.poses[row + 1]);
+        [1, 10, STEP].map(|lag| {
+            let starts = self.starts(lag + 1);
+            autocorrelation(starts.map(|row| [at(row), at(row + lag)]))
+        })
+    }
+
+    fn revisited(&self) -> f64 {
+        share(self.visits.iter().flat_map(|visit| {
+            let has_revisit = |row: usize| {
+                let mut others = visit.clone().filter(|other| other.abs_diff(row) > APART);
+                others.any(|other| is_near(&self.poses[row], &self.poses[other]))
+            };
+            visit.clone().map(has_revisit)
+        }))
+    }
+
+    /// The rows of later visits, each with the number of rows of earlier visits.
+    fn later(&self) -> impl Iterator<Item = (usize, usize)> {
+        let later = self.visits.iter().skip(1);
+        later.flat_map(|visit| visit.clone().map(|row| (row, visit.start)))
+    }
+
+    fn overlap(&self) -> Option<f64> {
+        let meets = |(row, earlier): (usize, usize)| {
+            (0..earlier).any(|other| is_near(&self.poses[row], &self.poses[other]))
+        };
+        (self.visits.len() > 1).then(|| share(self.later().map(meets)))
+    }
+
+    /// Errors of the frames of earlier visits with the least distance to those of later visits.
+    fn across(&self, distance: impl Fn(usize, usize) -> f64) -> Option<MedianError> {
+        let retrieved = self.later().map(|(row, earlier)| {
+            let nearest = least(earlier, |other| distance(row, other));
+            (row, nearest)
+        });
+        MedianError::of(retrieved, self.poses)
     }
 }
 
@@ -172,10 +186,10 @@ impl MedianError {
 }
 
 /// The rows of each visit.
-fn visits(room: &Room) -> Vec<std::ops::Range<usize>> {
+fn visits(room: &Room) -> Vec<Range<usize>> {
     let frame = |row: usize| FrameId(row as u32);
     let joins = |row: usize| room.timeline().joins(frame(row - 1), frame(row));
-    let mut visits: Vec<std::ops::Range<usize>> = Vec::new();
+    let mut visits: Vec<Range<usize>> = Vec::new();
     for row in 0..room.frame_count() {
         match visits.last_mut() {
             Some(visit) if joins(row) => visit.end = row + 1,
@@ -186,7 +200,7 @@ fn visits(room: &Room) -> Vec<std::ops::Range<usize>> {
 }
 
 /// The windows of 125 frames within visits.
-fn windows(visits: &[std::ops::Range<usize>]) -> impl Iterator<Item = std::ops::Range<usize>> {
+fn windows(visits: &[Range<usize>]) -> impl Iterator<Item = Range<usize>> {
     visits.iter().flat_map(|visit| {
         let starts = visit.clone().step_by(WINDOW);
         let end = visit.end;
