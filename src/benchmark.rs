@@ -21,6 +21,9 @@ use seese3_lab::benchmark::{Benchmark, Submission, score};
 use seese3_lab::report::{benchmark_page, benchmark_table};
 use seese3_store::Store;
 
+/// Largest benchmark or submission that is read, bytes.
+const MOST_BYTES: u64 = 256 << 20;
+
 /// Freeze rooms and pairs as a benchmark, and score submissions of retrieved frames
 #[derive(Debug, Args)]
 pub struct BenchmarkCommand {
@@ -92,8 +95,8 @@ struct Check {
     /// The benchmark file
     #[arg(long, value_name = "FILE")]
     benchmark: PathBuf,
-    /// The submission files
-    #[arg(value_name = "SUBMISSION", required = true)]
+    /// A submission file; may be given several times
+    #[arg(long = "submission", value_name = "FILE", required = true)]
     submissions: Vec<PathBuf>,
 }
 
@@ -105,8 +108,8 @@ struct Score {
     /// The store with its rooms
     #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
     store: String,
-    /// The submission files
-    #[arg(value_name = "SUBMISSION", required = true)]
+    /// A submission file; may be given several times
+    #[arg(long = "submission", value_name = "FILE", required = true)]
     submissions: Vec<PathBuf>,
     /// Also write a page of results to this Markdown file
     #[arg(long, value_name = "FILE.md")]
@@ -137,6 +140,11 @@ impl Freeze {
             rooms.push(store.load_room(&name, None).await?.room);
         }
 
+        ensure!(
+            !self.out.exists(),
+            "--out: {} exists; a benchmark that was frozen stays as it is. Give another name",
+            self.out.display()
+        );
         let benchmark = Benchmark::freeze(&self.name, &rooms, self.split, self.stride)?;
         let pairs: usize = benchmark.rooms.iter().map(|room| room.pair_count()).sum();
         say(format_args!(
@@ -191,6 +199,7 @@ impl Answer {
         progress.finish_and_clear();
 
         let submission = benchmark.submission(&self.name, &self.about, frames);
+        submission.check(&benchmark)?;
         write_json(&self.out, &submission)?;
         say(format_args!("wrote {}", self.out.display()));
         Ok(())
@@ -275,12 +284,14 @@ impl Score {
 
 fn read_benchmark(file: &std::path::Path) -> anyhow::Result<Benchmark> {
     let place = file.display();
-    let bytes = std::fs::read(file).with_context(|| format!("{place} cannot be read"))?;
+    let bytes = seese3_files::read(file, MOST_BYTES);
+    let bytes = bytes.with_context(|| format!("{place} cannot be read"))?;
     Benchmark::read(&bytes).with_context(|| format!("{place}"))
 }
 
 fn read_submission(file: &std::path::Path, benchmark: &Benchmark) -> anyhow::Result<Submission> {
     let place = file.display();
-    let bytes = std::fs::read(file).with_context(|| format!("{place} cannot be read"))?;
+    let bytes = seese3_files::read(file, MOST_BYTES);
+    let bytes = bytes.with_context(|| format!("{place} cannot be read"))?;
     Submission::read(&bytes, benchmark).with_context(|| format!("{place}"))
 }

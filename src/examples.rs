@@ -88,15 +88,15 @@ probe
   seese3 probe --store store --room kitchen --features pixels --stride 20 --split folds
 benchmark
   seese3 benchmark freeze --store suite --room 'studio7-*' --name rooms-7 --out rooms-7.json
-  seese3 benchmark score --benchmark rooms-7.json --store suite mine.json --page results.md
+  seese3 benchmark score --benchmark rooms-7.json --store suite --submission mine.json --page results.md
 benchmark freeze
   seese3 benchmark freeze --store suite --room 'studio7-*' --stride 25 --name rooms-7 --out rooms-7.json
 benchmark answer
   seese3 benchmark answer --benchmark rooms-7.json --store suite --adapter robot --name mine --about pixels --out mine.json
 benchmark check
-  seese3 benchmark check --benchmark rooms-7.json mine.json
+  seese3 benchmark check --benchmark rooms-7.json --submission mine.json
 benchmark score
-  seese3 benchmark score --benchmark rooms-7.json --store suite mine.json other.json --page results.md
+  seese3 benchmark score --benchmark rooms-7.json --store suite --submission mine.json --submission other.json --page results.md
 card
   seese3 card --store suite --room 'studio7-*' --features pixels --medians
 cross-room

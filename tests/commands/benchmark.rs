@@ -19,9 +19,12 @@ fn submissions_are_scored_as_evaluate_scores() {
         "benchmark answer --benchmark small.json --store store --adapter base --name paper --about";
     here.succeeds(&format!("{answer} affine --out paper.json"));
     let check = "benchmark check --benchmark small.json";
-    here.prints(&format!("{check} paper.json"), &["'paper' is valid"]);
     here.prints(
-        "benchmark score --benchmark small.json --store store paper.json --page page.md --json scores.json",
+        &format!("{check} --submission paper.json"),
+        &["'paper' is valid"],
+    );
+    here.prints(
+        "benchmark score --benchmark small.json --store store --submission paper.json --page page.md --json scores.json",
         &["paper", "identity", "over Identity"],
     );
     here.succeeds(
@@ -56,15 +59,15 @@ fn submissions_are_scored_as_evaluate_scores() {
     let text = std::fs::read_to_string(here.file("paper.json")).unwrap();
     std::fs::write(here.file("wrong.json"), text.replace("\"affine\"", "\"\"")).unwrap();
     here.refuses(
-        &format!("{check} wrong.json"),
+        &format!("{check} --submission wrong.json"),
         &["wrong.json", "about: must not be empty"],
     );
     here.refuses(
-        &format!("{check} small.json"),
+        &format!("{check} --submission small.json"),
         &["small.json", "submission"],
     );
     here.refuses(
-        "benchmark score --benchmark small.json --store store paper.json paper.json",
+        "benchmark score --benchmark small.json --store store --submission paper.json --submission paper.json",
         &["'paper' is in two submissions"],
     );
 }

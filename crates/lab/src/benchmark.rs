@@ -4,7 +4,7 @@
 //! room's poses. Its own SHA-256 identifies it. A [`Submission`] has one retrieved frame per pair,
 //! in the order of the benchmark.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde::de::IgnoredAny;
 use serde::{Deserialize, Serialize};
@@ -20,6 +20,9 @@ use seese3_core::statistics::{RoomMean, bootstrap_mean, mean, paired_difference}
 const BENCHMARK_FORMAT: &str = "seese3 benchmark 1";
 /// The format of a submission file.
 const SUBMISSION_FORMAT: &str = "seese3 submission 1";
+
+/// The name of the submission that stands still.
+const IDENTITY: &str = "identity";
 
 /// Why a benchmark or a submission is invalid. Each message names the field and what to change.
 #[derive(Debug, thiserror::Error, PartialEq)]
@@ -193,12 +196,33 @@ impl Benchmark {
             let problem = "does not match the content: the file was changed; take the original";
             return Err(Error::new("sha256", problem));
         }
-        check_thresholds(&benchmark.thresholds)
-            .map_err(|problem| Error::new("thresholds", problem.to_string()))?;
-        for room in &benchmark.rooms {
-            room.check(benchmark.stride)?;
-        }
+        benchmark.check()?;
         Ok(benchmark)
+    }
+
+    fn check(&self) -> Result<(), Error> {
+        check_text("name", &self.name)?;
+        self.split()?;
+        check_thresholds(&self.thresholds)
+            .map_err(|problem| Error::new("thresholds", problem.to_string()))?;
+        if self.stride == 0 {
+            return Err(Error::new("stride", "must be at least 1"));
+        }
+        if self.rooms.is_empty() {
+            return Err(Error::new("rooms", "must not be empty"));
+        }
+
+        let mut names = BTreeSet::new();
+        for room in &self.rooms {
+            room.check(self.stride)?;
+            if !names.insert(&room.room) {
+                return Err(Error::new(
+                    format!("room '{}'", room.room),
+                    "is there twice",
+                ));
+            }
+        }
+        Ok(())
     }
 
     /// The split of the pairs.
@@ -214,7 +238,7 @@ impl Benchmark {
     pub fn standing_still(&self) -> Submission {
         let sources = |room: &BenchmarkRoom| rows(&room.sources).collect();
         let frames = self.rooms.iter().map(sources).collect();
-        self.submission("identity", "Standing still: retrieves the source.", frames)
+        self.submission(IDENTITY, "Standing still: retrieves the source.", frames)
     }
 
     /// A submission with these retrieved frames, one list per room of the benchmark in order.
@@ -235,6 +259,14 @@ impl Benchmark {
 impl BenchmarkRoom {
     fn check(&self, stride: u32) -> Result<(), Error> {
         let place = || format!("room '{}'", self.room);
+        for ranges in [&self.sources, &self.candidates] {
+            let is_ascending = ranges.iter().all(|[first, last]| first <= last)
+                && ranges.windows(2).all(|pair| pair[0][1] < pair[1][0]);
+            if !is_ascending {
+                let problem = "has ranges that overlap or are not in ascending order";
+                return Err(Error::new(place(), problem));
+            }
+        }
         let last = |ranges: &[[u32; 2]]| ranges.iter().flatten().copied().max();
         let (Some(source), Some(candidate)) = (last(&self.sources), last(&self.candidates)) else {
             return Err(Error::new(place(), "has no pairs or no candidates"));
@@ -294,7 +326,11 @@ impl Submission {
         Ok(submission)
     }
 
-    fn check(&self, benchmark: &Benchmark) -> Result<(), Error> {
+    /// Checks the submission against the benchmark.
+    ///
+    /// # Errors
+    /// [`Error`] names the first field that is wrong.
+    pub fn check(&self, benchmark: &Benchmark) -> Result<(), Error> {
         if self.format != SUBMISSION_FORMAT {
             let problem = format!("is '{}', not '{SUBMISSION_FORMAT}'", self.format);
             return Err(Error::new("format", problem));
@@ -307,9 +343,22 @@ impl Submission {
             );
             return Err(Error::new("benchmark", problem));
         }
-        for (place, text) in [("name", &self.name), ("about", &self.about)] {
-            if text.trim().is_empty() {
-                return Err(Error::new(place, "must not be empty"));
+        check_text("name", &self.name)?;
+        check_text("about", &self.about)?;
+        if self.name == IDENTITY {
+            return Err(Error::new(
+                "name",
+                "is that of the baseline; choose another",
+            ));
+        }
+        if let Some(url) = &self.url {
+            let is_address = url.starts_with("https://") || url.starts_with("http://");
+            let is_plain = |c: char| c.is_ascii_graphic() && !"<>()[]\"`".contains(c);
+            if !is_address || !url.chars().all(is_plain) {
+                return Err(Error::new(
+                    "url",
+                    "must be an address that begins with https://",
+                ));
             }
         }
 
@@ -412,6 +461,17 @@ pub fn score(benchmark: &Benchmark, submission: &Submission, rooms: &[&[Pose]]) 
     }
 }
 
+/// Refuses an empty text, and characters that would break the line of a table or a page.
+fn check_text(place: &str, text: &str) -> Result<(), Error> {
+    if text.trim().is_empty() {
+        return Err(Error::new(place, "must not be empty"));
+    }
+    if text.chars().any(|c| c.is_control() || "|<>`".contains(c)) {
+        return Err(Error::new(place, "must be one line without | < > and `"));
+    }
+    Ok(())
+}
+
 /// The rows of ranges.
 fn rows(ranges: &[[u32; 2]]) -> impl Iterator<Item = u32> + '_ {
     ranges.iter().flat_map(|[first, last]| *first..=*last)
@@ -481,6 +541,9 @@ mod tests {
 
         assert!(refused(&|it| it.benchmark = "0".to_owned()).starts_with("benchmark: "));
         assert!(refused(&|it| it.about = " ".to_owned()).starts_with("about: "));
+        assert!(refused(&|it| it.about = "a\n# b".to_owned()).starts_with("about: "));
+        assert!(refused(&|it| it.name = "identity".to_owned()).starts_with("name: "));
+        assert!(refused(&|it| it.url = Some("javascript:x".to_owned())).starts_with("url: "));
         assert!(refused(&|it| it.frames.clear()).contains("is missing"));
         let other = refused(&|it| {
             it.frames.insert("other".to_owned(), Vec::new());
@@ -501,6 +564,21 @@ mod tests {
         let changed = file.replacen("\"stride\":10", "\"stride\":11", 1);
         let error = Benchmark::read(changed.as_bytes()).unwrap_err().to_string();
         assert!(error.starts_with("sha256: "), "{error}");
+
+        let wrong = |change: &dyn Fn(&mut Benchmark)| {
+            let mut changed = benchmark.clone();
+            change(&mut changed);
+            let file = serde_json::to_vec(&changed.file()).unwrap();
+            Benchmark::read(&file).unwrap_err().to_string()
+        };
+        assert!(wrong(&|it| it.rooms.clear()).starts_with("rooms: "));
+        assert!(wrong(&|it| it.stride = 0).starts_with("stride: "));
+        assert!(wrong(&|it| it.split = "other".to_owned()).starts_with("split: "));
+        assert!(wrong(&|it| it.rooms.push(it.rooms[0].clone())).contains("is there twice"));
+        let overlap = wrong(&|it| it.rooms[0].sources = vec![[0, 9], [5, 12]]);
+        assert!(overlap.contains("overlap"), "{overlap}");
+        let inverted = wrong(&|it| it.rooms[0].candidates = vec![[9, 0]]);
+        assert!(inverted.contains("ascending"), "{inverted}");
 
         let moved: Vec<Pose> = room.poses().iter().rev().copied().collect();
         assert!(benchmark.rooms[0].check_poses(room.poses()).is_ok());

@@ -126,15 +126,10 @@ impl RetrievalScores {
     pub fn hits_over(&self, baseline: &Self) -> Vec<(f64, MeanInterval)> {
         let blocks = blocks_of(&self.pairs);
         let difference = |epsilon: f64| {
-            let hit = |scores: &Self, position: usize| {
-                f64::from(u8::from(scores.pairs[position].is_hit(epsilon)))
-            };
-            let found = blocks.mean(|position| hit(self, position) - hit(baseline, position));
-            MeanInterval {
-                low: found.low.max(-1.0),
-                high: found.high.min(1.0),
-                ..found
-            }
+            blocks.rate_difference(
+                |position| self.pairs[position].is_hit(epsilon),
+                |position| baseline.pairs[position].is_hit(epsilon),
+            )
         };
         let thresholds = self.hits.iter().map(|(epsilon, _)| *epsilon);
         thresholds

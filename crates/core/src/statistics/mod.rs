@@ -202,15 +202,16 @@ pub fn paired_difference(ours: &[f64], theirs: &[f64], seed: u64) -> RoomMean {
 pub struct RecordedMedian {
     /// The median.
     pub median: f64,
-    /// The lower end of the interval, at least the smallest value.
+    /// The lower end of the interval.
     pub low: f64,
-    /// The upper end of the interval, at most the largest value.
+    /// The upper end of the interval.
     pub high: f64,
 }
 
 /// Median of values in recording order. The interval allows for correlated neighbors: it is the
 /// standard deviation of medians of resampled contiguous blocks, at most 10 of equal length (the
-/// last may be shorter), times the quantile of Student's t. NaN without values.
+/// last may be shorter), times the quantile of Student's t. With one value it is unbounded. NaN
+/// without values.
 ///
 /// In simulated recordings of correlated values, it covers the median in 88 to 94 % of cases;
 /// percentiles of the resampled medians of 20 blocks cover it in 78 to 90 %.
@@ -222,14 +223,11 @@ pub fn median_of_recording(values: &[f64], seed: u64) -> RecordedMedian {
         .chunks(values.len().div_ceil(BLOCKS).max(1))
         .collect();
     let median_of_all = median(values);
-    let range = values.iter().copied();
-    let smallest = range.clone().fold(f64::NAN, f64::min);
-    let largest = range.fold(f64::NAN, f64::max);
     if blocks.len() < 2 {
         return RecordedMedian {
             median: median_of_all,
-            low: smallest,
-            high: largest,
+            low: f64::NEG_INFINITY,
+            high: f64::INFINITY,
         };
     }
 
@@ -251,8 +249,8 @@ pub fn median_of_recording(values: &[f64], seed: u64) -> RecordedMedian {
 
     RecordedMedian {
         median: median_of_all,
-        low: (median_of_all - reach).max(smallest),
-        high: (median_of_all + reach).min(largest),
+        low: median_of_all - reach,
+        high: median_of_all + reach,
     }
 }
 
@@ -261,13 +259,14 @@ mod tests {
     use super::*;
 
     /// Oracle: by hand. From five blocks of zeros and five of ones, half of the resamples have the
-    /// median 0 or 1 each, so the interval is cut at the values' range. If 0 and 1 alternate within
-    /// the blocks, every resample has the median 0.5.
+    /// median 0 or 1 each, so the interval contains both. If 0 and 1 alternate within the blocks,
+    /// every resample has the median 0.5.
     #[test]
     fn medians_of_a_recording_are_resampled_by_blocks() {
         let stays: Vec<f64> = (0..1_000).map(|i| f64::from(i / 500)).collect();
         let found = median_of_recording(&stays, 1);
-        assert_eq!((found.low, found.median, found.high), (0.0, 0.5, 1.0));
+        assert_eq!(found.median, 0.5);
+        assert!(found.low <= 0.0 && found.high >= 1.0, "{found:?}");
 
         let alternates: Vec<f64> = (0..1_000).map(|i| f64::from(i % 2)).collect();
         let found = median_of_recording(&alternates, 1);
@@ -275,7 +274,8 @@ mod tests {
 
         assert!(median_of_recording(&[], 1).median.is_nan());
         let alone = median_of_recording(&[3.0], 1);
-        assert_eq!((alone.low, alone.median, alone.high), (3.0, 3.0, 3.0));
+        assert_eq!(alone.median, 3.0);
+        assert!(alone.low < 0.0 && alone.high > 1e9);
     }
 
     /// Oracle: the definition of a 95 % interval, for errors that keep their value over 10 frames
