@@ -2,7 +2,7 @@
 
 use super::Error;
 use super::columns::ParquetColumn::{Real, Text, Whole};
-use super::columns::parquet_file;
+use super::columns::{ParquetColumn, parquet_file};
 use crate::experiments::EstimateError;
 use crate::experiments::cross_room::CrossRoomRun;
 use seese3_core::eval::{RetrievedPair, Row};
@@ -22,25 +22,7 @@ struct PairRow<'a> {
 /// [`Error::Parquet`] if the library rejects a column.
 pub fn retrieval_errors_file(room: &str, rows: &[Row]) -> Result<Vec<u8>, Error> {
     let pairs: Vec<PairRow<'_>> = pair_rows(room, rows, [0, 0]).collect();
-    parquet_file(
-        &pairs,
-        &[
-            ("room", Text(|row| row.room)),
-            ("navigator", Text(|row| row.navigator)),
-            ("source", Whole(|row| u64::from(row.pair.pair.source.0))),
-            ("target", Whole(|row| u64::from(row.pair.pair.target.0))),
-            ("retrieved", Whole(|row| u64::from(row.pair.retrieved.0))),
-            ("twist_error", Real(|row| row.pair.twist_error)),
-            (
-                "translation_m",
-                Real(|row| row.pair.pose_error.translation_m),
-            ),
-            (
-                "rotation_deg",
-                Real(|row| row.pair.pose_error.rotation_rad.to_degrees()),
-            ),
-        ],
-    )
+    parquet_file(&pairs, &pair_columns())
 }
 
 /// The bytes of a Parquet file with a row for each run, held-out room, navigator and pair.
@@ -56,27 +38,35 @@ pub fn cross_room_errors_file(runs: &[CrossRoomRun]) -> Result<Vec<u8>, Error> {
         }
     }
 
-    parquet_file(
-        &pairs,
-        &[
-            ("learned_rooms", Whole(|row| row.learned_rooms)),
-            ("seed", Whole(|row| row.seed)),
-            ("room", Text(|row| row.room)),
-            ("navigator", Text(|row| row.navigator)),
-            ("source", Whole(|row| u64::from(row.pair.pair.source.0))),
-            ("target", Whole(|row| u64::from(row.pair.pair.target.0))),
-            ("retrieved", Whole(|row| u64::from(row.pair.retrieved.0))),
-            ("twist_error", Real(|row| row.pair.twist_error)),
-            (
-                "translation_m",
-                Real(|row| row.pair.pose_error.translation_m),
-            ),
-            (
-                "rotation_deg",
-                Real(|row| row.pair.pose_error.rotation_rad.to_degrees()),
-            ),
-        ],
-    )
+    let mut columns = vec![
+        (
+            "learned_rooms",
+            Whole(|row: &PairRow<'_>| row.learned_rooms),
+        ),
+        ("seed", Whole(|row| row.seed)),
+    ];
+    columns.extend(pair_columns());
+    parquet_file(&pairs, &columns)
+}
+
+/// The columns of one pair.
+fn pair_columns<'a>() -> Vec<(&'static str, ParquetColumn<PairRow<'a>>)> {
+    vec![
+        ("room", Text(|row| row.room)),
+        ("navigator", Text(|row| row.navigator)),
+        ("source", Whole(|row| u64::from(row.pair.pair.source.0))),
+        ("target", Whole(|row| u64::from(row.pair.pair.target.0))),
+        ("retrieved", Whole(|row| u64::from(row.pair.retrieved.0))),
+        ("twist_error", Real(|row| row.pair.twist_error)),
+        (
+            "translation_m",
+            Real(|row| row.pair.pose_error.translation_m),
+        ),
+        (
+            "rotation_deg",
+            Real(|row| row.pair.pose_error.rotation_rad.to_degrees()),
+        ),
+    ]
 }
 
 fn pair_rows<'a>(
