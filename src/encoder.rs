@@ -71,8 +71,8 @@ pub struct EncoderOptions {
     /// declares, except those of keypoints
     #[arg(long, value_delimiter = ',', default_value = "all")]
     layers: Vec<String>,
-    /// Pooling of a layer's output to one row: cls, mean, grid2x2, grid4x4 or any gridCOLUMNSxROWS;
-    /// the recipe's if omitted, else mean
+    /// Pooling of a layer's output to one row: cls, mean, grid2x2, grid4x4 or any gridCOLUMNSxROWS,
+    /// of clips also anchor (the mean over the anchor image); the recipe's if omitted, else mean
     #[arg(long)]
     pool: Option<String>,
     /// Number of tokens before the patch tokens (class token and registers), which pooling skips;

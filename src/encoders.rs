@@ -43,7 +43,7 @@ impl Encoders {
             say(WITHOUT_RECIPE);
         }
 
-        for recipe in chosen {
+        for recipe in &chosen {
             say(format_args!("{}: {}", recipe.name, recipe.about));
             say(format_args!(
                 "  images   {}",
@@ -62,6 +62,18 @@ impl Encoders {
                 }
             }
 
+            say("");
+        }
+
+        if self.name.is_none() {
+            say("What was run:");
+            for recipe in &chosen {
+                say(format_args!(
+                    "  {:<16} {}",
+                    recipe.name,
+                    recipe.weights.words()
+                ));
+            }
             say("");
         }
 
@@ -92,5 +104,6 @@ fn recipe_json(recipe: &EncoderRecipe) -> serde_json::Value {
         "layers": recipe.layers,
         "pooling": recipe.pooling.to_string(),
         "prefix_tokens": recipe.prefix_tokens,
+        "run": recipe.weights.words(),
     })
 }

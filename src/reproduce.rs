@@ -7,7 +7,7 @@ use std::time::Instant;
 use anyhow::{Context, bail};
 use clap::Args;
 use serde::Serialize;
-use serde_json::{Value, json};
+use serde_json::Value;
 use tokio::runtime::Handle;
 
 use seese3_core::adapter::{Adapter, TrainingRecord};
@@ -16,8 +16,8 @@ use seese3_core::image::RgbImage;
 use seese3_core::room::{FrameId, Room, is_plain_name};
 use seese3_lab::report::Document;
 use seese3_lab::reproduction::{
-    EXPERIMENTS, FeatureSet, Images, Journal, Options, Reproduced, ReproducedAdapter, Reproduction,
-    ReproductionRecord, adapter_names, check, reproduce,
+    EXPERIMENTS, FeatureSet, Images, Journal, LayerSet, Options, Reproduced, ReproducedAdapter,
+    Reproduction, ReproductionRecord, adapter_names, check, reproduce,
 };
 
 use super::output::{JsonOutput, say, write_file, write_intermediate, write_json};
@@ -53,6 +53,13 @@ pub struct Reproduce {
     /// Numbers of training rooms along the scaling curve
     #[arg(long, value_delimiter = ',', default_values_t = [5, 10, 20, 35, 50, 75, 100])]
     sizes: Vec<usize>,
+    /// Number of trainings of every size, each with another choice of rooms and another seed; 1 to 100
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..=100))]
+    trainings: u64,
+    /// Features of several layers of one encoder, separated by commas, to be compared in the rooms
+    /// of --in-room
+    #[arg(long, value_delimiter = ',')]
+    layers: Vec<String>,
     /// Number of training rooms used for calibration, in which the adapter's errors are measured
     #[arg(long, default_value_t = 20)]
     calibration_rooms: usize,
@@ -60,13 +67,18 @@ pub struct Reproduce {
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
     seeds: u64,
     /// Number of seeds for the table of the alternatives A to D; the paper uses 15; 1 to 100
-    #[arg(long, default_value_t = 15, value_parser = clap::value_parser!(u64).range(1..=100))]
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..=100))]
     formulation_seeds: u64,
+    /// Epochs of the long training of the alternatives A to D, by which they are judged: 200, the
+    /// paper's, take hours; 0 leaves it out
+    #[arg(long, default_value_t = 200)]
+    formulation_epochs: usize,
     /// Epochs, instead of every preset's own; for a quick trial
     #[arg(long)]
     epochs: Option<usize>,
-    /// Folder of the report; created if it does not exist. Until the report is complete, it has
-    /// finished steps and trained adapters in `steps`; the same command goes on from there
+    /// Folder of the report; created if it does not exist. Its folder `steps` keeps finished parts
+    /// and trained adapters: a later run reuses those whose options, rooms and features are the
+    /// same
     #[arg(long, default_value = "reproduction")]
     out: PathBuf,
     #[command(flatten)]
@@ -94,6 +106,21 @@ impl LoadedSet {
     }
 }
 
+/// The rooms that are learned alone, with the features of one layer.
+struct LoadedLayer {
+    features: String,
+    rooms: Vec<Loaded>,
+}
+
+impl LoadedLayer {
+    fn borrowed(&self) -> LayerSet<'_> {
+        LayerSet {
+            features: self.features.clone(),
+            rooms: self.rooms.iter().map(data).collect(),
+        }
+    }
+}
+
 /// Reads the image of a frame from the room's original folder.
 fn recorded_image(room: &Room, frame: FrameId) -> Result<RgbImage, String> {
     let root = PathBuf::from(&room.provenance().images_root);
@@ -107,11 +134,13 @@ impl Reproduce {
         let store = Store::open(&self.store)?;
         store.check_writable().await?;
         let sets = self.load(&store).await?;
-        let journal = FolderJournal::open(&self.out.join(STEPS), &self.identity(&sets)?)?;
+        let layers = self.load_layers(&store).await?;
+        let journal = FolderJournal::open(&self.out.join(STEPS))?;
         let reproduction = Reproduction {
             options: self.options(),
             journal: &journal,
             sets: sets.iter().map(LoadedSet::borrowed).collect(),
+            layers: layers.iter().map(LoadedLayer::borrowed).collect(),
             images: Images {
                 read: &recorded_image,
                 png: &|image| encode_png(image).map_err(|error| error.to_string()),
@@ -147,28 +176,7 @@ impl Reproduce {
         };
 
         write(&self.out, &document, &record)?;
-        journal.finish()?;
         self.json.write(&record)
-    }
-
-    /// What a run depends on: the program, the options, and the revisions of the rooms. Only a run
-    /// of the same identity goes on where another one stopped.
-    fn identity(&self, sets: &[LoadedSet]) -> anyhow::Result<Value> {
-        let rooms = |rooms: &[Loaded]| -> Vec<String> {
-            let named = rooms.iter().map(|(stored, features)| {
-                let source = features.source();
-                format!("{} {} {source:?}", stored.room.id(), stored.revision)
-            });
-            named.collect()
-        };
-        let sets = sets.iter().map(|set| {
-            json!({ "train": rooms(&set.train), "test": rooms(&set.test), "in_room": rooms(&set.in_room) })
-        });
-        Ok(json!({
-            "version": env!("CARGO_PKG_VERSION"),
-            "options": serde_json::to_value(self.options())?,
-            "sets": sets.collect::<Vec<_>>(),
-        }))
     }
 
     fn options(&self) -> Options {
@@ -176,9 +184,11 @@ impl Reproduce {
             stride: self.stride,
             strides: self.strides.clone(),
             sizes: self.sizes.clone(),
+            trainings: self.trainings,
             calibration_rooms: self.calibration_rooms,
             seeds: self.seeds,
             formulation_seeds: self.formulation_seeds,
+            formulation_epochs: self.formulation_epochs,
             epochs: self.epochs,
         }
     }
@@ -196,12 +206,24 @@ impl Reproduce {
 
         Ok(sets)
     }
+
+    async fn load_layers(&self, store: &Store) -> anyhow::Result<Vec<LoadedLayer>> {
+        let mut layers = Vec::new();
+        for features in &self.layers {
+            layers.push(LoadedLayer {
+                features: features.clone(),
+                rooms: load_rooms(store, &self.in_room, Some(features)).await?,
+            });
+        }
+
+        Ok(layers)
+    }
 }
 
-/// The folder of finished steps, in that of the report.
+/// The folder of finished parts, in that of the report.
 const STEPS: &str = "steps";
 
-/// A journal in a folder: a JSON file for each finished step, and a store of trained adapters.
+/// A journal in a folder: a JSON file for each finished part, and a store of trained adapters.
 struct FolderJournal {
     folder: PathBuf,
     store: Store,
@@ -209,28 +231,17 @@ struct FolderJournal {
 }
 
 impl FolderJournal {
-    /// Opens the journal of a run, or begins one.
-    fn open(folder: &Path, identity: &Value) -> anyhow::Result<Self> {
+    /// Opens the journal in a folder, or begins one.
+    fn open(folder: &Path) -> anyhow::Result<Self> {
         let adapters = folder.join("adapters");
+        if adapters.exists() {
+            say(format_args!(
+                "reusing finished parts of {}",
+                folder.display()
+            ));
+        }
         std::fs::create_dir_all(&adapters)
             .with_context(|| format!("{} cannot be created", folder.display()))?;
-        let file = folder.join("run.json");
-        if file.exists() {
-            let bytes = seese3_files::read(&file, seese3_files::SMALL_FILE_BYTES);
-            let bytes = bytes.with_context(|| file.display().to_string())?;
-            let known: Value = serde_json::from_slice(&bytes)
-                .with_context(|| format!("{} is damaged", file.display()))?;
-            if known != *identity {
-                bail!(
-                    "{} has steps of a run with other options, rooms or another version; give another --out, or remove \
-                     that folder",
-                    folder.display()
-                );
-            }
-            say(format_args!("going on from {}", folder.display()));
-        } else {
-            write_intermediate(&file, identity)?;
-        }
 
         let location = adapters.to_str().context("--out is not UTF-8")?;
         Ok(Self {
@@ -240,31 +251,25 @@ impl FolderJournal {
         })
     }
 
-    fn file(&self, step: &str) -> PathBuf {
-        self.folder.join(format!("{step}.json"))
-    }
-
-    /// Removes the journal of a complete run.
-    fn finish(self) -> anyhow::Result<()> {
-        std::fs::remove_dir_all(&self.folder)
-            .with_context(|| format!("{} cannot be removed", self.folder.display()))
+    fn file(&self, part: &str) -> PathBuf {
+        self.folder.join(format!("{part}.json"))
     }
 }
 
 impl Journal for FolderJournal {
-    fn step(&self, name: &str) -> Result<Option<Value>, String> {
+    fn part(&self, name: &str) -> Result<Option<Value>, String> {
         let file = self.file(name);
         let bytes = match std::fs::read(&file) {
             Ok(bytes) => bytes,
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
             Err(error) => return Err(format!("{}: {error}", file.display())),
         };
-        let step = serde_json::from_slice(&bytes);
-        step.map_err(|error| format!("{}: {error}; remove it", file.display()))
+        let part = serde_json::from_slice(&bytes);
+        part.map_err(|error| format!("{}: {error}; remove it", file.display()))
     }
 
-    fn keep_step(&self, name: &str, step: &Value) -> Result<(), String> {
-        write_intermediate(&self.file(name), step).map_err(|error| format!("{error:#}"))
+    fn keep_part(&self, name: &str, part: &Value) -> Result<(), String> {
+        write_intermediate(&self.file(name), part).map_err(|error| format!("{error:#}"))
     }
 
     fn adapter(&self, name: &str) -> Result<Option<(Adapter, TrainingRecord)>, String> {
@@ -275,12 +280,12 @@ impl Journal for FolderJournal {
         }
     }
 
-    fn keep_adapter(&self, adapter: &ReproducedAdapter) -> Result<(), String> {
+    fn keep_adapter(&self, name: &str, adapter: &ReproducedAdapter) -> Result<(), String> {
         let ReproducedAdapter {
-            name,
             adapter,
             record,
             golden_features,
+            ..
         } = adapter;
         let published = self
             .store
@@ -355,6 +360,20 @@ async fn publish(
 fn write(out: &Path, document: &Document, record: &FileRecord) -> anyhow::Result<()> {
     for picture in document.pictures() {
         write_file(&out.join(&picture.name), &picture.bytes)?;
+        #[cfg(feature = "plots")]
+        if let Some(name) = picture.name.strip_suffix(".svg") {
+            let pdf = seese3_lab::report::plot_pdf(&picture.bytes)?;
+            write_file(&out.join(format!("{name}.pdf")), &pdf)?;
+        }
+    }
+
+    let tables = out.join("tables");
+    std::fs::create_dir_all(&tables)
+        .with_context(|| format!("{} cannot be created", tables.display()))?;
+    for (name, table) in document.tables() {
+        write_file(&tables.join(format!("{name}.csv")), table.csv().as_bytes())?;
+        let latex = table.escaped_for_latex().latex();
+        write_file(&tables.join(format!("{name}.tex")), latex.as_bytes())?;
     }
 
     write_file(&out.join("report.md"), document.markdown("").as_bytes())?;
@@ -362,7 +381,7 @@ fn write(out: &Path, document: &Document, record: &FileRecord) -> anyhow::Result
     write_json(&out.join("record.json"), record)?;
 
     say(format_args!(
-        "wrote {0}/report.html, {0}/report.md and {0}/record.json",
+        "wrote {0}/report.html, {0}/report.md, {0}/record.json and the tables in {0}/tables",
         out.display()
     ));
 

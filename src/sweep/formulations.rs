@@ -9,7 +9,9 @@ use super::super::protocol::ProtocolOptions;
 use super::super::rooms::{data, load_rooms, room_words};
 use crate::table_files::TableFiles;
 use seese3_core::training::RoomData;
-use seese3_lab::experiments::formulations::{RoomPooling, compare};
+use seese3_lab::experiments::formulations::{
+    FormulationPlan, RoomPooling, compare, run_formulation,
+};
 use seese3_lab::formulations::Formulation;
 use seese3_lab::report::formulations_table;
 use seese3_store::Store;
@@ -65,14 +67,16 @@ impl Formulations {
 
         let count = Formulation::VARIANTS.len() as u64 * self.seeds;
         let progress = bar(count, "formulations");
-        let comparison = compare(
-            &room_data,
-            plan,
-            &self.protocol.splits(),
-            self.seeds,
-            pooling,
-            &|| progress.inc(1),
-        )?;
+        let formulation_plan = FormulationPlan {
+            training: plan,
+            splits: &self.protocol.splits(),
+            room_pooling: pooling,
+        };
+        let comparison = compare(self.seeds, &|which, seed| {
+            let run = run_formulation(which, seed, &room_data, &formulation_plan);
+            progress.inc(1);
+            run
+        })?;
         progress.finish_and_clear();
 
         say(format_args!(

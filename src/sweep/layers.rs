@@ -63,9 +63,14 @@ pub struct Layers {
     /// camera path rather than that of the room
     #[arg(long, default_value_t = 10)]
     m2_gap: usize,
-    /// Also print one line per encoder, with its best layer, to compare checkpoints of one encoder
+    /// Also print one line per encoder, with its best layer by the scores shown, to compare
+    /// checkpoints of one encoder
     #[arg(long)]
     by_encoder: bool,
+    /// The paper's comparison of checkpoints (App. A.8): --by-encoder with M1 at stride 5, M4 by
+    /// paper-range with 15 seeds
+    #[arg(long, conflicts_with_all = ["preset", "seeds", "m1_stride", "by_encoder"])]
+    ablation: bool,
     #[command(flatten)]
     files: TableFiles,
     #[command(flatten)]
@@ -77,9 +82,15 @@ impl Layers {
         clippy::too_many_lines,
         reason = "one command, from its arguments to what it prints"
     )]
-    pub async fn run(self) -> anyhow::Result<()> {
+    pub async fn run(mut self) -> anyhow::Result<()> {
         self.json.begin()?;
         self.files.begin()?;
+        if self.ablation {
+            self.by_encoder = true;
+            self.m1_stride = 5;
+            self.preset = Preset::PaperRange;
+            self.seeds = 15;
+        }
 
         ensure!(
             self.split != SplitChoice::One(Split::Whole),

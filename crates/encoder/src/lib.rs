@@ -51,7 +51,7 @@ pub use pooling::Pooling;
 pub use preparation::{Filter, Preparation, Resize, normalized};
 pub use preprocess::Preprocess;
 pub use preprocess_file::read_preprocess_file;
-pub use recipes::{EncoderRecipe, RECIPES, recipe};
+pub use recipes::{EncoderRecipe, RECIPES, RunWeights, recipe};
 pub use run::{Encoded, Kept, OnBadImage, Task, encode_room};
 pub use runtime::{Runtime, RuntimeKind};
 pub use thumbnail::thumbnail;

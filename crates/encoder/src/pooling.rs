@@ -23,6 +23,12 @@ pub enum Pooling {
         /// The number of tokens before the patches: the class token and registers.
         skip: usize,
     },
+    /// The mean over the patch tokens of a clip's anchor image, which is at position ⌊window / 2⌋;
+    /// only for encoders of clips.
+    Anchor {
+        /// The number of tokens before the patches.
+        skip: usize,
+    },
     /// Means over the cells of a map, or of the patch tokens after the first `skip`, arranged in
     /// the rows and columns of the image's patches.
     Grid {
@@ -47,7 +53,10 @@ impl Pooling {
     /// Refuses a mean or grid over all tokens if their number shows that prefix tokens (class
     /// token, registers) come before the patches.
     pub(super) fn check_prefix(self, shape: &[usize], seen: InputSize) -> Result<(), Problem> {
-        let is_over_all = matches!(self, Self::Mean { skip: 0 } | Self::Grid { skip: 0, .. });
+        let is_over_all = matches!(
+            self,
+            Self::Mean { skip: 0 } | Self::Anchor { skip: 0 } | Self::Grid { skip: 0, .. }
+        );
 
         match (shape, is_over_all) {
             (&[tokens, _], true) => match seen.prefix(tokens) {
@@ -64,6 +73,7 @@ impl Pooling {
         match self {
             Self::Vector | Self::Cls => self,
             Self::Mean { .. } => Self::Mean { skip },
+            Self::Anchor { .. } => Self::Anchor { skip },
             Self::Grid { columns, rows, .. } => Self::Grid {
                 columns,
                 rows,
@@ -150,6 +160,19 @@ impl Pooling {
                 });
 
                 Ok(grid(map.view(), columns, rows))
+            }
+            (Self::Anchor { skip }, 2) if skip < shape[0] => {
+                // A token that covers the whole clip is not of one image.
+                let patches = seen.patches(shape[0] - skip);
+                let (times, height, width) =
+                    patches.filter(|(times, ..)| *times > 1).ok_or_else(wrong)?;
+                let tokens = output.into_dimensionality::<Ix2>().map_err(|_| wrong())?;
+
+                let time = seen.window / 2 * times / seen.window;
+                let first = skip + time * height * width;
+                let of_anchor = ndarray::s![first..first + height * width, ..];
+                let patches = tokens.slice_move(of_anchor).reversed_axes();
+                Ok(grid(patches.insert_axis(Axis(1)), 1, 1))
             }
             (Self::Mean { .. }, 3) if shape[1] * shape[2] > 0 => Ok(grid(
                 output.into_dimensionality::<Ix3>().map_err(|_| wrong())?,
@@ -239,7 +262,8 @@ fn grid(map: ArrayView3<'_, f32>, columns: usize, rows: usize) -> Vec<f32> {
 pub(super) enum Problem {
     #[error(
         "its output of shape {shape:?} cannot be pooled by '{pooling}': cls needs tokens (n, c); grids need a map (c, h, w), \
-         or patch tokens in the rows and columns of the image's aspect ratio, after the prefix tokens"
+         or patch tokens in the rows and columns of the image's aspect ratio, after the prefix tokens; anchor needs such \
+         tokens of a clip"
     )]
     Shape { pooling: Pooling, shape: Vec<usize> },
     #[error(
@@ -264,6 +288,10 @@ impl fmt::Display for Pooling {
                 f.write_str("mean")?;
                 *skip
             }
+            Self::Anchor { skip } => {
+                f.write_str("anchor")?;
+                *skip
+            }
             Self::Grid {
                 columns,
                 rows,
@@ -285,14 +313,14 @@ impl fmt::Display for Pooling {
 impl FromStr for Pooling {
     type Err = Error;
 
-    /// Reads `vector`, `cls`, `mean` or `gridCxR` (columns × rows). `@N` after it skips the first N
+    /// Reads `vector`, `cls`, `mean`, `anchor` or `gridCxR` (columns × rows). `@N` after it skips the first N
     /// tokens.
     fn from_str(text: &str) -> Result<Self, Error> {
         let wrong = || Error::Option {
             what: "pooling",
             given: text.to_owned(),
             problem: format!(
-                "is not cls, mean, or gridCxR with 1 to {MOST_CELLS} columns and rows"
+                "is not cls, mean, anchor, or gridCxR with 1 to {MOST_CELLS} columns and rows"
             )
             .into(),
         };
@@ -306,6 +334,7 @@ impl FromStr for Pooling {
             "vector" => Self::Vector,
             "cls" => Self::Cls,
             "mean" => Self::Mean { skip },
+            "anchor" => Self::Anchor { skip },
             _ => {
                 let cells = |text: &str| text.parse().ok().filter(|n| (1..=MOST_CELLS).contains(n));
                 let grid = word
@@ -440,10 +469,46 @@ mod tests {
         );
     }
 
+    /// Oracle: by hand. A clip of 4 images of 2×2 patches, with a class token before them. The anchor
+    /// is image 2: with a token for each image its patches are tokens 9 to 12, with tokens of two
+    /// images those of the second time, 5 to 8.
+    #[test]
+    fn the_anchor_is_the_middle_image_of_a_clip() {
+        let seen = InputSize {
+            window: 4,
+            ..SQUARE
+        };
+        let anchor: Pooling = "anchor@1".parse().unwrap();
+        let tokens = |count: usize| {
+            let numbers = Array2::from_shape_fn((count, 1), |(n, _)| n as f32);
+            numbers.into_dyn()
+        };
+        assert_eq!(anchor.pool(tokens(17).view(), seen).unwrap(), [10.5]);
+        assert_eq!(anchor.pool(tokens(9).view(), seen).unwrap(), [6.5]);
+
+        assert!(
+            anchor.pool(tokens(10).view(), seen).is_err(),
+            "one token for the clip"
+        );
+        assert!(
+            anchor.pool(tokens(5).view(), SQUARE).is_err(),
+            "a single image"
+        );
+    }
+
     /// Oracle: the syntax in the documentation.
     #[test]
     fn words_are_read_and_written() {
-        for word in ["vector", "cls", "mean", "mean@5", "grid2x2", "grid16x12@1"] {
+        for word in [
+            "vector",
+            "cls",
+            "mean",
+            "mean@5",
+            "anchor",
+            "anchor@1",
+            "grid2x2",
+            "grid16x12@1",
+        ] {
             assert_eq!(word.parse::<Pooling>().unwrap().to_string(), word);
         }
 

@@ -37,10 +37,35 @@ pub struct EncoderRecipe {
     pub keypoints: Option<KeypointOutputs>,
     /// Its use in the paper.
     pub paper: String,
-    /// Whether it was run in this project, and the sources of the recipe's numbers.
+    /// The weights with which the export was run in this project.
+    pub weights: RunWeights,
+    /// What was checked, and the sources of the recipe's numbers.
     pub checked: String,
     /// Python code that exports it to an ONNX file.
     pub export: String,
+}
+
+/// The weights with which an export was run in this project.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum RunWeights {
+    /// The published, trained weights.
+    Trained,
+    /// Random weights, of this model or of a smaller one with the same blocks.
+    Random,
+    /// It was not run.
+    None,
+}
+
+impl RunWeights {
+    /// In words, for tables.
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::Trained => "run with trained weights",
+            Self::Random => "run with random weights, not with trained weights",
+            Self::None => "not run",
+        }
+    }
 }
 
 /// All recipes.

@@ -120,7 +120,7 @@ impl Blocks {
             .collect();
         let (mean, variance) = mean_of_blocks(&sums);
         let reach = match variance {
-            Some(variance) => t_quantile_975(sums.len() - 1) * variance.sqrt(),
+            Some(variance) => t_quantile_975((sums.len() - 1) as f64) * variance.sqrt(),
             None => f64::INFINITY,
         };
 
@@ -164,7 +164,7 @@ impl Rate {
             spread => spread / variance,
         };
         let trials = trials.min(independent.n as f64);
-        let [low, high] = wilson(rate, trials, t_quantile_975(blocks.len() - 1));
+        let [low, high] = wilson(rate, trials, t_quantile_975((blocks.len() - 1) as f64));
 
         Self {
             low: low.min(independent.low),

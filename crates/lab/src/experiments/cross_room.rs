@@ -30,6 +30,11 @@ use crate::json;
 /// mean.
 pub const CLIPPED_R2: f64 = -1.0;
 
+/// max(R², [`CLIPPED_R2`]); NaN stays NaN.
+pub fn clipped_r2(r2: f64) -> f64 {
+    r2.clamp(CLIPPED_R2, f64::INFINITY)
+}
+
 /// The scores of an adapter in one room.
 #[derive(Debug, Clone, Serialize)]
 pub struct RoomOutcome {

@@ -39,8 +39,12 @@ impl FoldedMotions {
 
     /// Scores over the pairs of all splits of a room together, averaged over rooms.
     pub fn scores(&self) -> MotionScores {
-        let rooms: Vec<MotionScores> = self.rooms().iter().map(ReadMotions::scores).collect();
-        MotionScores::mean(&rooms)
+        MotionScores::mean(&self.room_scores())
+    }
+
+    /// Scores over the pairs of all splits of a room together, one per room.
+    pub fn room_scores(&self) -> Vec<MotionScores> {
+        self.rooms().iter().map(ReadMotions::scores).collect()
     }
 
     /// The overall R² of the constant baseline, pooled and averaged as in

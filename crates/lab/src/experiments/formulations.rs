@@ -1,7 +1,7 @@
 //! Compares the adapter with the paper's alternatives A to D and the constant, over several seeds.
 
 use rayon::prelude::*;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use strum::VariantArray;
 
 use seese3_core::motion_scores::{MotionScores, ReadMotions};
@@ -34,15 +34,32 @@ pub struct FormulationScores {
     /// One score per seed, in seed order.
     #[serde(serialize_with = "json::each::<json::MotionJson, _, _>")]
     pub runs: Vec<MotionScores>,
+    /// Overall R² by seed and room.
+    pub r2_by_seed_and_room: Vec<Vec<f64>>,
+}
+
+/// The scores of one formulation with one seed.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct FormulationRun {
+    /// One score per room, over the test pairs of all splits together.
+    pub rooms: Vec<MotionScores>,
+    /// R² of the constant baseline; mean over rooms.
+    pub constant_r2: f64,
 }
 
 impl FormulationScores {
-    /// The scores of a formulation, one per seed.
-    pub fn new(name: &'static str, runs: Vec<MotionScores>) -> Self {
+    /// The scores of a formulation, from one run per seed.
+    pub fn new(which: Formulation, runs: &[FormulationRun]) -> Self {
+        let means: Vec<MotionScores> = runs
+            .iter()
+            .map(|run| MotionScores::mean(&run.rooms))
+            .collect();
+        let overall = |run: &FormulationRun| run.rooms.iter().map(|room| room.overall).collect();
         Self {
-            name,
-            by_part: PartsJson::from(&runs),
-            runs,
+            name: which.into(),
+            by_part: PartsJson::from(&means),
+            runs: means,
+            r2_by_seed_and_room: runs.iter().map(overall).collect(),
         }
     }
 }
@@ -56,55 +73,67 @@ pub enum RoomPooling {
     Together,
 }
 
-/// Trains every formulation under every split in `splits`, with seeds from 0 to `seeds` − 1, on
-/// all cores. The split of `plan` is ignored. `done` is called after each seed of a formulation.
+/// How formulations are trained and tested.
+pub struct FormulationPlan<'a> {
+    /// The training. Its split and seed are ignored.
+    pub training: &'a TrainingPlan,
+    /// Every split trains a network.
+    pub splits: &'a [Split],
+    /// One network per room, or one for all.
+    pub room_pooling: RoomPooling,
+}
+
+/// Trains every formulation with seeds from 0 to `seeds` − 1, on all cores. `run` trains one
+/// formulation with one seed, usually by [`run_formulation`].
 ///
 /// # Errors
-/// [`Error::Training`] when a room is too short or the plan has settings that only the adapter
-/// supports.
+/// The first error of `run`.
 pub fn compare(
-    rooms: &[RoomData<'_>],
-    plan: &TrainingPlan,
-    splits: &[Split],
     seeds: u64,
-    room_pooling: RoomPooling,
-    done: &(dyn Fn() + Sync),
+    run: &(dyn Fn(Formulation, u64) -> Result<FormulationRun, Error> + Sync),
 ) -> Result<Comparison, Error> {
     let tasks: Vec<(Formulation, u64)> = Formulation::VARIANTS
         .iter()
         .flat_map(|&which| (0..seeds).map(move |seed| (which, seed)))
         .collect();
-
-    let runs: Vec<(Formulation, MotionScores, f64)> = tasks
+    let runs: Vec<FormulationRun> = tasks
         .into_par_iter()
-        .map(|(which, seed)| {
-            let read = FoldedMotions::of(splits, |split| {
-                let plan = TrainingPlan {
-                    split,
-                    ..plan.with_seed(seed)
-                };
-                one_run(which, rooms, &plan, room_pooling)
-            })?;
-            done();
-
-            Ok((which, read.scores(), read.constant_r2()))
-        })
+        .map(|(which, seed)| run(which, seed))
         .collect::<Result<_, Error>>()?;
 
-    // Group the runs of all tasks by formulation.
-    let scores_of = |which: Formulation| {
-        let own = runs.iter().filter(|(other, ..)| *other == which);
-        FormulationScores::new(which.into(), own.map(|(_, scores, _)| *scores).collect())
-    };
-
+    // The tasks are in the order of the formulations.
+    let by_formulation = runs.chunks(seeds as usize);
+    let scores = Formulation::VARIANTS.iter().zip(by_formulation);
     Ok(Comparison {
-        formulations: Formulation::VARIANTS
-            .iter()
-            .copied()
-            .map(scores_of)
+        formulations: scores
+            .map(|(&which, runs)| FormulationScores::new(which, runs))
             .collect(),
         // The constant is the same for every formulation and seed.
-        constant_r2: runs.first().map_or(f64::NAN, |&(_, _, constant)| constant),
+        constant_r2: runs.first().map_or(f64::NAN, |run| run.constant_r2),
+    })
+}
+
+/// Trains one formulation with one seed and scores it in each room.
+///
+/// # Errors
+/// [`Error::Training`] when a room is too short or the plan has settings that only the adapter
+/// supports.
+pub fn run_formulation(
+    which: Formulation,
+    seed: u64,
+    rooms: &[RoomData<'_>],
+    plan: &FormulationPlan<'_>,
+) -> Result<FormulationRun, Error> {
+    let read = FoldedMotions::of(plan.splits, |split| {
+        let training = TrainingPlan {
+            split,
+            ..plan.training.with_seed(seed)
+        };
+        one_run(which, rooms, &training, plan.room_pooling)
+    })?;
+    Ok(FormulationRun {
+        rooms: read.room_scores(),
+        constant_r2: read.constant_r2(),
     })
 }
 

@@ -105,6 +105,22 @@ impl Document {
             })
     }
 
+    /// Every table of the report with a file name without extension: the number of its section, the
+    /// number of the table in the section, and the words of the section's title.
+    pub fn tables(&self) -> impl Iterator<Item = (String, &Table)> {
+        (1..).zip(&self.sections).flat_map(|(number, section)| {
+            let words = file_words(&section.title);
+            let tables = section.blocks.iter().filter_map(|block| match block {
+                Block::Table(table) => Some(table),
+                _ => None,
+            });
+            let name = move |place: usize| format!("{number:02}-{place}-{words}");
+            (1..)
+                .zip(tables)
+                .map(move |(place, table)| (name(place), table))
+        })
+    }
+
     /// The report as Markdown. Links to pictures point into `folder`, a path relative to the
     /// Markdown file; an empty `folder` is the folder of that file.
     pub fn markdown(&self, folder: &str) -> String {
@@ -176,6 +192,18 @@ impl Document {
     }
 }
 
+/// The first words of a title as part of a file name: ASCII letters and digits, joined by hyphens.
+fn file_words(title: &str) -> String {
+    const WORDS: usize = 4;
+    let words = title.split(|letter: char| !letter.is_ascii_alphanumeric());
+    let words: Vec<String> = words
+        .filter(|word| !word.is_empty())
+        .take(WORDS)
+        .map(str::to_ascii_lowercase)
+        .collect();
+    words.join("-")
+}
+
 const STYLE: &str = "body{font:16px/1.5 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem}\
 table{border-collapse:collapse;margin:1rem 0;font-variant-numeric:tabular-nums}\
 th,td{border-bottom:1px solid #ccc;padding:.2rem .6rem;text-align:right}\
@@ -229,5 +257,18 @@ mod tests {
         );
 
         assert!(!html.contains("p.svg"), "the file is self-contained");
+    }
+
+    /// Oracle: the naming rule, by hand.
+    #[test]
+    fn tables_have_file_names() {
+        let document = document();
+        let (name, table) = document.tables().next().unwrap();
+        assert_eq!(name, "01-1-r-0");
+        assert_eq!(table.csv(), "a|b,n\nx,1\n");
+        assert_eq!(
+            file_words("M4: the adapter by stride, within a room"),
+            "m4-the-adapter-by"
+        );
     }
 }

@@ -1,22 +1,49 @@
 //! Verdicts on the paper's claims, and on ours, from the given rooms.
+//!
+//! A claim is tested in several cases, such as feature sets or strides. A case is a mean over rooms
+//! that is above zero where the claim holds. [`judge`] corrects the tests of all claims together,
+//! and only then decides.
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-use seese3_core::statistics::{Rate, RoomMean};
+use seese3_core::statistics::{RoomMean, bootstrap_mean, crossed_mean, holm, sign_flip_p};
 
 use crate::report::Column::{self, Text};
-use crate::report::{Section, Table};
+use crate::report::{Section, Table, room_difference_text};
+
+/// Largest adjusted p-value with which a case counts as decided.
+const SIGNIFICANCE: f64 = 0.05;
 
 /// A claim and the evidence found for or against it.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Claim {
     /// The claim, one sentence.
     pub claim: String,
-    /// Whether these rooms confirm it.
+    /// The quantity of each room whose mean is tested: above zero where the claim holds.
+    pub tested: String,
+    /// Whether these rooms confirm it; [`Verdict::Untested`] until [`judge`] decides.
     #[serde(serialize_with = "word", deserialize_with = "of_word")]
     pub verdict: Verdict,
-    /// The evidence for the verdict, in words.
-    pub found: String,
+    /// The cases in which it was tested.
+    pub cases: Vec<Case>,
+}
+
+/// A test of a claim in one case.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Case {
+    /// The feature set, the stride or the alternative.
+    pub case: String,
+    /// The mean over rooms with its 95 % interval, not corrected for the number of tests; `None`
+    /// without rooms.
+    pub mean: Option<RoomMean>,
+    /// Number of trainings with different seeds, where their spread is part of the interval.
+    pub trainings: Option<usize>,
+    /// Two-sided p-value of a mean of zero.
+    pub p: Option<f64>,
+    /// The same with Holm's correction for all tests of the report.
+    pub adjusted_p: Option<f64>,
+    /// Why the case decides nothing, where it was not tested.
+    pub reason: Option<String>,
 }
 
 fn word<S: Serializer>(verdict: &Verdict, to: S) -> Result<S::Ok, S::Error> {
@@ -32,14 +59,94 @@ fn of_word<'de, D: Deserializer<'de>>(from: D) -> Result<Verdict, D::Error> {
 }
 
 impl Claim {
-    /// A claim decided by one confidence interval per feature set; see [`Verdict::of_intervals`].
-    /// `criterion` says when it holds for a feature set.
-    pub fn over_feature_sets(claim: &'static str, criterion: &str, cases: &[Option<bool>]) -> Self {
+    /// A claim to be judged. `tested` is the quantity of each room whose mean is above zero where
+    /// the claim holds.
+    pub fn new(claim: &str, tested: &str, cases: Vec<Case>) -> Self {
         Self {
             claim: claim.to_owned(),
-            verdict: Verdict::of_intervals(cases),
-            found: format!("{criterion}: {}", count_words(cases, "feature sets")),
+            tested: tested.to_owned(),
+            verdict: Verdict::Untested,
+            cases,
         }
+    }
+}
+
+impl Case {
+    /// One value per room, with a bootstrap interval and the sign-flip test over the rooms. Rooms
+    /// whose value is NaN are left out.
+    pub fn of_rooms(case: impl Into<String>, values: &[f64]) -> Self {
+        let known: Vec<f64> = values.iter().copied().filter(|x| !x.is_nan()).collect();
+        if known.is_empty() {
+            return Self::untested(case, None, "no room has a value");
+        }
+        Self {
+            case: case.into(),
+            mean: Some(bootstrap_mean(&known, 0)),
+            trainings: None,
+            p: Some(sign_flip_p(&known, 0)),
+            adjusted_p: None,
+            reason: None,
+        }
+    }
+
+    /// The differences `ours − theirs`, paired by room.
+    pub fn of_difference(case: impl Into<String>, ours: &[f64], theirs: &[f64]) -> Self {
+        let differences: Vec<f64> = ours.iter().zip(theirs).map(|(a, b)| a - b).collect();
+        Self::of_rooms(case, &differences)
+    }
+
+    /// A value per training and room, with the spread of both; see [`crossed_mean`].
+    pub fn of_trainings(case: impl Into<String>, by_training: &[Vec<f64>]) -> Self {
+        let rooms = by_training.first().map_or(0, Vec::len);
+        let Some(crossed) = crossed_mean(by_training) else {
+            let values = by_training.first().map_or(&[][..], Vec::as_slice);
+            let reason = format!(
+                "{} trainings in {rooms} rooms: their spread is unknown",
+                by_training.len()
+            );
+            return Self::untested(case, Some(values), &reason);
+        };
+        Self {
+            case: case.into(),
+            mean: Some(RoomMean {
+                mean: crossed.mean,
+                low: crossed.low,
+                high: crossed.high,
+                rooms,
+            }),
+            trainings: Some(by_training.len()),
+            p: Some(crossed.p),
+            adjusted_p: None,
+            reason: None,
+        }
+    }
+
+    /// A case that decides nothing, with the mean of `values` if there are any.
+    pub fn untested(case: impl Into<String>, values: Option<&[f64]>, reason: &str) -> Self {
+        let values = values.filter(|values| !values.is_empty());
+        Self {
+            case: case.into(),
+            mean: values.map(|values| bootstrap_mean(values, 0)),
+            trainings: None,
+            p: None,
+            adjusted_p: None,
+            reason: Some(reason.to_owned()),
+        }
+    }
+
+    /// The case without its test, for the given reason.
+    pub fn without_test(self, reason: String) -> Self {
+        Self {
+            p: None,
+            reason: Some(reason),
+            ..self
+        }
+    }
+
+    /// Whether the claim holds in this case; `None` if the test does not decide.
+    fn holds(&self) -> Option<bool> {
+        let is_decided = self.adjusted_p? < SIGNIFICANCE;
+        is_decided.then_some(self.mean?.mean > 0.0)
     }
 }
 
@@ -48,11 +155,11 @@ impl Claim {
 pub enum Verdict {
     /// The claim holds in every case.
     Confirmed,
-    /// The claim holds in no case.
+    /// The claim fails in every case.
     Contradicted,
-    /// The claim holds for some feature sets or rooms and not for others.
+    /// Some cases are decided, and not all of them alike or not all.
     Mixed,
-    /// No case is conclusive: the baselines fail there too, or every interval contains the limit.
+    /// No case is decided.
     CannotTell,
     /// There is no case to test the claim on.
     Untested,
@@ -68,34 +175,19 @@ impl Verdict {
         Self::Untested,
     ];
 
-    /// Confirmed if the claim holds in every case, contradicted if it holds in no case.
-    pub fn of(holds: &[bool]) -> Self {
-        let held = holds.iter().filter(|&&holds| holds).count();
-        match held {
-            _ if holds.is_empty() => Self::Untested,
-            0 => Self::Contradicted,
-            count if count == holds.len() => Self::Confirmed,
-            _ => Self::Mixed,
-        }
-    }
-
-    /// As [`Verdict::of`], over the conclusive cases. `None` is an inconclusive case, which is
-    /// ignored.
-    pub fn of_telling(cases: &[Option<bool>]) -> Self {
-        let telling: Vec<bool> = cases.iter().copied().flatten().collect();
-        if telling.is_empty() && !cases.is_empty() {
-            return Self::CannotTell;
-        }
-        Self::of(&telling)
-    }
-
-    /// The verdict over cases decided by confidence intervals. `None` is undecided: its interval
-    /// contains the limit, or there are too few rooms. A claim is confirmed or contradicted only if
-    /// all intervals agree.
-    pub fn of_intervals(cases: &[Option<bool>]) -> Self {
-        match Self::of_telling(cases) {
-            Self::Confirmed | Self::Contradicted if cases.contains(&None) => Self::Mixed,
-            verdict => verdict,
+    /// The verdict over cases; `None` is an undecided case.
+    fn of(cases: &[Option<bool>]) -> Self {
+        let all_are = |outcome: Option<bool>| cases.iter().all(|&case| case == outcome);
+        if cases.is_empty() {
+            Self::Untested
+        } else if all_are(None) {
+            Self::CannotTell
+        } else if all_are(Some(true)) {
+            Self::Confirmed
+        } else if all_are(Some(false)) {
+            Self::Contradicted
+        } else {
+            Self::Mixed
         }
     }
 
@@ -110,113 +202,155 @@ impl Verdict {
     }
 }
 
-/// Whether a claim holds for each of several cases: false if one case fails, else `None` if one
-/// case is inconclusive.
-pub fn holds_for_each(cases: &[Option<bool>]) -> Option<bool> {
-    if cases.contains(&Some(false)) {
-        Some(false)
-    } else if cases.contains(&None) {
-        None
-    } else {
-        Some(true)
+/// Decides all claims of a report: adjusts the p-values of all their cases together by Holm's
+/// method.
+pub fn judge(claims: &mut [Claim]) {
+    let all = claims.iter().flat_map(|claim| &claim.cases);
+    let p_values: Vec<f64> = all.filter_map(|case| case.p).collect();
+    let mut adjusted = holm(&p_values).into_iter();
+
+    for claim in claims {
+        for case in &mut claim.cases {
+            case.adjusted_p = case.p.and_then(|_| adjusted.next());
+        }
+        let holds: Vec<Option<bool>> = claim.cases.iter().map(Case::holds).collect();
+        claim.verdict = Verdict::of(&holds);
     }
 }
 
-/// Minimum number of rooms for a bootstrap interval to be conclusive. Five differences of the same
-/// sign occur by chance with probability 1/16.
-const FEWEST_ROOMS: usize = 6;
-
-/// Whether a mean over rooms is above zero; `None` if its interval is inconclusive.
-pub fn is_above_zero(mean: &RoomMean) -> Option<bool> {
-    if mean.rooms < FEWEST_ROOMS {
-        None
-    } else if mean.low > 0.0 {
-        Some(true)
-    } else if mean.high < 0.0 {
-        Some(false)
-    } else {
-        None
-    }
-}
-
-/// Whether a fraction of rooms is above one half; `None` if its interval is inconclusive.
-pub fn is_most(share: &Rate) -> Option<bool> {
-    if share.low > 0.5 {
-        Some(true)
-    } else if share.high < 0.5 {
-        Some(false)
-    } else {
-        None
-    }
-}
-
-/// The number of cases in which a claim holds, and of inconclusive cases, in words.
-pub fn count_words(cases: &[Option<bool>], of_what: &str) -> String {
-    let telling: Vec<bool> = cases.iter().copied().flatten().collect();
-    let held = telling.iter().filter(|&&held| held).count();
-    let silent = cases.len() - telling.len();
-
-    let mut words = format!("so in {held} of {} {of_what}", telling.len());
-    if silent > 0 {
-        words.push_str(&format!("; {silent} more cannot tell"));
-    }
-    words
-}
-
-/// The table of claims, one row per claim.
+/// The table of claims, and the table of their tests. [`judge`] decided the claims.
 pub fn section(claims: &[Claim]) -> Section {
     let mut section = Section::new("The paper's claims in these rooms");
 
-    let columns: [Column<Claim>; 3] = [
-        Text("claim", |claim| claim.claim.clone()),
-        Text("here", |claim| claim.verdict.word().to_owned()),
-        Text("what was found", |claim| claim.found.clone()),
+    let columns: [Column<(usize, &Claim)>; 5] = [
+        Text("claim", |(_, claim)| claim.claim.clone()),
+        Text("here", |(_, claim)| claim.verdict.word().to_owned()),
+        Text("decided", |(_, claim)| counts(claim)),
+        Text("above zero where it holds", |(_, claim)| {
+            claim.tested.clone()
+        }),
+        Text("tests", |(number, _)| number.to_string()),
     ];
-    section.table(Table::of(claims, &columns));
+    let numbered: Vec<(usize, &Claim)> = (1..).zip(claims).collect();
+    section.table(Table::of(&numbered, &columns));
+
+    let tests = claims.iter().flat_map(|claim| &claim.cases);
+    let count = tests.filter(|case| case.p.is_some()).count();
+    section.text(format!(
+        "The {count} tests. Means over rooms with 95 % intervals, not corrected; p is of the sign-flip test over rooms, or, \
+         with several trainings, of Student's t with the spread of rooms and trainings. A case is decided where p, by \
+         Holm's correction for all {count} tests, is below {SIGNIFICANCE}. A claim is confirmed if it holds in every case, \
+         contradicted if it fails in every case, and mixed if only some cases are decided or they disagree."
+    ));
+    section.table(tests_table(claims));
     section
+}
+
+/// How many cases of a claim hold, fail and are open, in words.
+fn counts(claim: &Claim) -> String {
+    let of = |outcome: Option<bool>| {
+        let cases = claim.cases.iter();
+        cases.filter(|case| case.holds() == outcome).count()
+    };
+    let parts = [
+        (of(Some(true)), "holds"),
+        (of(Some(false)), "fails"),
+        (of(None), "open"),
+    ];
+    let words = parts
+        .iter()
+        .filter(|(count, _)| *count > 0)
+        .map(|(count, word)| format!("{word} in {count}"));
+    words.collect::<Vec<_>>().join(", ")
+}
+
+fn tests_table(claims: &[Claim]) -> Table {
+    let mut table =
+        Table::new("test of claim | case | rooms | trainings | mean [95 %] | p | p, corrected");
+    for (number, claim) in (1..).zip(claims) {
+        for case in &claim.cases {
+            let p = case.p.map(p_text);
+            let adjusted = case.adjusted_p.map(p_text);
+            let cells = [
+                case.case.clone(),
+                case.mean
+                    .map_or(String::new(), |mean| mean.rooms.to_string()),
+                case.trainings
+                    .map_or(String::new(), |trainings| trainings.to_string()),
+                case.mean
+                    .map_or(String::new(), |mean| room_difference_text(&mean)),
+                p.or_else(|| case.reason.clone()).unwrap_or_default(),
+                adjusted.unwrap_or_default(),
+            ];
+            table.row(number.to_string(), cells);
+        }
+    }
+    table
+}
+
+fn p_text(p: f64) -> String {
+    if p < 0.001 {
+        "< 0.001".to_owned()
+    } else {
+        format!("{p:.3}")
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// Oracle: Wilson's interval of 3 of 3 rooms is 0.44 to 1 and contains one half. 10 of 10 rooms
-    /// is conclusive, and so is 0 of 10.
-    #[test]
-    fn few_rooms_cannot_tell_what_most_do() {
-        assert_eq!(is_most(&Rate::of(3, 3)), None);
-        assert_eq!(is_most(&Rate::of(10, 10)), Some(true));
-        assert_eq!(is_most(&Rate::of(0, 10)), Some(false));
+    fn claim(cases: Vec<Case>) -> Claim {
+        Claim::new("c", "t", cases)
     }
 
-    /// Oracle: the meaning of "each": one failure decides, and one unknown case leaves it open.
+    /// Oracle: by hand. Twenty rooms of one sign decide a case even after the correction for four
+    /// tests (2 · 2⁻²⁰ · 4), four rooms do not (2 · 2⁻⁴ = 0.125), and six rooms do alone (0.031)
+    /// but not among four tests.
     #[test]
-    fn a_claim_about_each_fails_with_one() {
-        assert_eq!(holds_for_each(&[Some(true), Some(true)]), Some(true));
-        assert_eq!(holds_for_each(&[Some(true), None]), None);
-        assert_eq!(holds_for_each(&[None, Some(false)]), Some(false));
-    }
+    fn tests_are_corrected_over_all_claims() {
+        let high = |rooms: usize| Case::of_rooms("x", &vec![0.3; rooms]);
+        let low = Case::of_rooms("x", &[-0.3; 20]);
 
-    /// Oracle: the words of the verdicts.
-    #[test]
-    fn cases_that_cannot_tell_decide_nothing() {
-        let word = |cases: &[Option<bool>]| Verdict::of_telling(cases).word();
-        assert_eq!(word(&[Some(true), None]), "confirmed");
-        assert_eq!(word(&[Some(false), None]), "contradicted");
-        assert_eq!(word(&[Some(false), Some(true)]), "mixed");
-        assert_eq!(word(&[None, None]), "cannot be told here");
+        let mut alone = [claim(vec![high(6)])];
+        judge(&mut alone);
+        assert_eq!(alone[0].verdict, Verdict::Confirmed);
 
-        let word = |cases: &[Option<bool>]| Verdict::of_intervals(cases).word();
-        assert_eq!(word(&[Some(true), None]), "mixed");
-        assert_eq!(word(&[Some(true), Some(true)]), "confirmed");
-        assert_eq!(word(&[None]), "cannot be told here");
-
-        let word = |cases: &[Option<bool>]| Verdict::of_telling(cases).word();
-        assert_eq!(word(&[]), "not tested");
-
+        let mut claims = [
+            claim(vec![high(20)]),
+            claim(vec![low, high(4)]),
+            claim(vec![high(6)]),
+        ];
+        judge(&mut claims);
+        let verdicts = claims.each_ref().map(|claim| claim.verdict);
         assert_eq!(
-            count_words(&[Some(true), Some(false), None], "rooms"),
-            "so in 1 of 2 rooms; 1 more cannot tell"
+            verdicts,
+            [Verdict::Confirmed, Verdict::Mixed, Verdict::CannotTell]
         );
+    }
+
+    /// Oracle: the meaning of the words.
+    #[test]
+    fn a_verdict_says_whether_all_cases_agree() {
+        let word = |cases: &[Option<bool>]| Verdict::of(cases).word();
+        assert_eq!(word(&[Some(true), Some(true)]), "confirmed");
+        assert_eq!(word(&[Some(false), Some(false)]), "contradicted");
+        assert_eq!(word(&[Some(false), Some(true)]), "mixed");
+        assert_eq!(word(&[Some(true), None]), "mixed");
+        assert_eq!(word(&[None, None]), "cannot be told here");
+        assert_eq!(word(&[]), "not tested");
+    }
+
+    /// Oracle: one training has no spread, and an untested case has no p-value.
+    #[test]
+    fn a_case_without_a_test_decides_nothing() {
+        let one = Case::of_trainings("x", &[vec![0.5; 30]]);
+        let none = Case::of_rooms("x", &[f64::NAN]);
+        let few = Case::of_rooms("x", &[0.5; 30]).without_test("too few seeds".to_owned());
+        let mut claims = [claim(vec![one, none, few])];
+        judge(&mut claims);
+
+        assert_eq!(claims[0].verdict, Verdict::CannotTell);
+        assert!(claims[0].cases.iter().all(|case| case.reason.is_some()));
     }
 }

@@ -3,21 +3,25 @@
 
 use serde::Serialize;
 
-use seese3_core::statistics::{bootstrap_mean, mean, paired_difference};
+use seese3_core::navigation::NavigatorKind;
+use seese3_core::statistics::{bootstrap_mean, mean_of_known, paired_difference};
 
-use super::claims::{Claim, is_above_zero, is_most};
+use super::claims::{Case, Claim};
 use super::notes::published_name;
-use super::plans::{PlanResult, SetResults};
+use super::plans::{AdapterPlan, PlanKind, SetResults, SizeResults};
 use super::{Error, Found, Reproduction, paper};
-use crate::experiments::cross_room::{CrossRoomRun, MotionSummary, wins};
+use crate::experiments::cross_room::{CrossRoomRun, MotionSummary, RoomOutcome, wins};
 use crate::report::{
-    CrossRoomJson, Figure, Section, Series, Table, count_text, cross_room_json, room_mean_text,
+    CrossRoomJson, Figure, Section, Series, Table, count_text, cross_room_json,
+    room_difference_text, room_mean_text, spread_text,
 };
 
 /// The paper's navigator.
 pub const AFFINE: &str = "inverse-poincare-affine";
 /// The refit on z-scored motions. The ridge's α would over-shrink raw meters and radians.
 const REFIT: &str = "ridge-refit-z-scored-in-sample";
+/// The same, fitted on other frames than those that are scored.
+const REFIT_OF_FIRST_VISIT: &str = "ridge-refit-z-scored";
 /// The service's navigator.
 pub const HOMOGENEOUS: &str = "inverse-poincare-homogeneous";
 
@@ -27,7 +31,10 @@ pub struct ZeroShotRecord {
     features: String,
     /// The adapters' names in the store, by increasing number of training rooms.
     adapters: Vec<String>,
+    /// Runs by increasing number of rooms, then by seed.
     paper_range_by_size: CrossRoomJson,
+    /// The adapter of all rooms, seed 0, in later visits of the held-out rooms.
+    second_visits: CrossRoomJson,
 }
 
 /// Builds the section on zero-shot navigation and on scaling.
@@ -50,12 +57,23 @@ pub fn section(
     }
 
     section.text(format!(
-        "Preset paper-range on all rooms that are learned together, one seed; every pair of a held-out room at stride \
-         {}, all its frames are candidates, the source included. Intervals of counts are Wilson's; of means, those of \
-         drawing the rooms again. The refit is fitted on the very pairs it is scored on.",
+        "Preset paper-range on all rooms that are learned together, seed 0; every pair of a held-out room at stride {}, all \
+         its frames are candidates, the source included. Intervals of counts are Wilson's; of means, those of drawing the \
+         rooms again. Refits in sample are fitted on the very pairs they are scored on: they remember the path, the more \
+         the shorter the recording is. The rows of other visits say what such a refit is worth later:",
         given.options.stride
     ));
+    section.table(second_visits_table(results));
+    section.text(
+        "Held-out rooms with several visits: pairs and candidates are of the later ones, the refit is fitted on the first.",
+    );
 
+    section.table(scaling_table(results));
+    section.text(format!(
+        "Preset paper-range by the number of rooms learned from, {} trainings each with another choice of rooms and another \
+         seed: mean over held-out rooms and trainings ± standard deviation over trainings.",
+        given.options.trainings
+    ));
     add_curves(&mut section, results)?;
     claims.extend(claims_of(results));
 
@@ -64,116 +82,199 @@ pub fn section(
 }
 
 fn record(set: &SetResults) -> ZeroShotRecord {
-    let name = |result: &PlanResult| published_name(&result.plan.adapter_name(), &set.features);
-    let runs: Vec<CrossRoomRun> = set
+    let runs = set
         .by_size
         .iter()
-        .map(|result| result.run.clone())
-        .collect();
+        .flat_map(|size| size.runs.iter().cloned());
+    let runs: Vec<CrossRoomRun> = runs.collect();
+    let name = |size: &SizeResults| {
+        let plan = AdapterPlan {
+            kind: PlanKind::PaperRange,
+            rooms: size.rooms,
+            seed: 0,
+        };
+        published_name(&plan.adapter_name(), &set.features)
+    };
 
     ZeroShotRecord {
         features: set.features.clone(),
         adapters: set.by_size.iter().map(name).collect(),
         paper_range_by_size: cross_room_json(&runs, AFFINE),
+        second_visits: cross_room_json(std::slice::from_ref(&set.second_visits), AFFINE),
     }
 }
 
-/// Verdicts by the confidence intervals, not only by the fraction of rooms or the mean.
-fn claims_of(results: &[SetResults]) -> [Claim; 4] {
-    let over = |ours: &CrossRoomRun, name: &str, theirs: &CrossRoomRun| {
-        let difference = paired_difference(&ours.hit_rates(name), &theirs.hit_rates(AFFINE), 0);
-        is_above_zero(&difference)
+/// A measure of one held-out room by which transfer is judged.
+struct Measure {
+    name: &'static str,
+    of: fn(&RoomOutcome) -> f64,
+}
+
+/// Ours, then the two of the paper's scaling figure.
+const MEASURES: [Measure; 3] = [
+    Measure {
+        name: "Hit@0.1",
+        of: |outcome| outcome.hit_rate(AFFINE).map_or(f64::NAN, |rate| rate.rate),
+    },
+    Measure {
+        name: "share of rooms with R² > 0",
+        of: |outcome| f64::from(u8::from(outcome.motion.overall > 0.0)),
+    },
+    Measure {
+        name: "mean max(R², 0)",
+        of: |outcome| outcome.motion.overall.clamp(0.0, f64::INFINITY),
+    },
+];
+
+fn claims_of(results: &[SetResults]) -> Vec<Claim> {
+    let per_set = |case: &dyn Fn(&SetResults) -> Case| results.iter().map(case).collect();
+    let refit = |run: &CrossRoomRun, features: &str, refit: &str| {
+        Case::of_difference(features, &run.hit_rates(refit), &run.hit_rates(AFFINE))
     };
 
-    let mut zero_shot = Vec::new();
-    let mut refitted = Vec::new();
-    let mut grows = Vec::new();
-    let mut keeps_growing = Vec::new();
-    for set in results {
-        let whole = &set.baseline().run;
-        zero_shot.push(wins(&whole.outcomes, AFFINE).as_ref().and_then(is_most));
-        refitted.push(over(whole, REFIT, whole));
-
-        if let [fewest, .., all] = set.by_size.as_slice() {
-            grows.push(over(&all.run, AFFINE, &fewest.run));
-
-            // On a plateau, the second half of the rooms would add nothing.
-            let is_half = |result: &&PlanResult| 2 * result.plan.rooms <= all.plan.rooms;
-            let half = set.by_size.iter().rfind(is_half);
-            keeps_growing.extend(half.map(|half| over(&all.run, AFFINE, &half.run)));
-        }
-    }
-
-    [
-        Claim::over_feature_sets(
+    vec![
+        Claim::new(
             "zero-shot navigation beats Identity in most rooms never seen (Hit@0.1)",
-            "Wilson's interval of the share of rooms is above one half",
-            &zero_shot,
+            "½ in a room with more hits than Identity, −½ in the others",
+            per_set(&|set| {
+                let run = &set.baseline().run;
+                let pairs = run.hit_rates(AFFINE).into_iter();
+                let pairs = pairs.zip(run.hit_rates(&NavigatorKind::Identity.name()));
+                let won = pairs.map(|(ours, identity)| if ours > identity { 0.5 } else { -0.5 });
+                Case::of_rooms(&set.features, &won.collect::<Vec<f64>>())
+            }),
         ),
-        Claim::over_feature_sets(
-            "refitting the linear step in the room itself does better than zero-shot",
-            "the interval of the difference in Hit@0.1 of the z-scored refit, in sample, is above zero",
-            &refitted,
+        Claim::new(
+            "refitting the linear step in the room, on the pairs that are scored, does better than zero-shot",
+            "Hit@0.1 of the z-scored refit in sample minus zero-shot",
+            per_set(&|set| refit(&set.baseline().run, &set.features, REFIT)),
         ),
-        Claim::over_feature_sets(
+        Claim::new(
+            "refitting it in a first visit does better than zero-shot in the next visit",
+            "Hit@0.1 in later visits of the z-scored refit of the first visit minus zero-shot",
+            per_set(&|set| refit(&set.second_visits, &set.features, REFIT_OF_FIRST_VISIT)),
+        ),
+        Claim::new(
             "more training rooms transfer better",
-            "the interval of the difference in Hit@0.1 of all rooms over the fewest is above zero",
-            &grows,
+            "with all rooms minus with the fewest",
+            growth(results, |sizes| sizes.first()),
         ),
-        Claim::over_feature_sets(
+        Claim::new(
             "and without a plateau",
-            "the interval of the difference in Hit@0.1 of all rooms over half of them is above zero",
-            &keeps_growing,
+            "with all rooms minus with at most half of them",
+            growth(results, |sizes| {
+                // On a plateau, the second half of the rooms would add nothing.
+                let all = sizes.last()?.rooms;
+                sizes.iter().rfind(|size| 2 * size.rooms <= all)
+            }),
         ),
     ]
 }
 
-/// A curve by increasing numbers of training rooms.
-struct ScalingCurve {
-    file: &'static str,
-    title: &'static str,
-    y: &'static str,
-    caption: &'static str,
-    /// The value of a run; NaN if no room has an R².
-    of: fn(&CrossRoomRun) -> f64,
+/// For each feature set and measure, the difference of all rooms over the size that `fewer`
+/// chooses, by training and room. Trainings are paired by seed: with one seed, fewer rooms are a
+/// part of more rooms.
+fn growth(results: &[SetResults], fewer: fn(&[SizeResults]) -> Option<&SizeResults>) -> Vec<Case> {
+    let mut cases = Vec::new();
+    for set in results {
+        let (Some(all), Some(fewer)) = (set.by_size.last(), fewer(&set.by_size)) else {
+            continue;
+        };
+        if fewer.rooms == all.rooms {
+            continue;
+        }
+        for measure in &MEASURES {
+            let runs = all.runs.iter().zip(&fewer.runs);
+            let by_training: Vec<Vec<f64>> = runs
+                .map(|(all, fewer)| {
+                    let rooms = all.outcomes.iter().zip(&fewer.outcomes);
+                    rooms
+                        .map(|(all, fewer)| (measure.of)(all) - (measure.of)(fewer))
+                        .collect()
+                })
+                .collect();
+            let case = format!(
+                "{}, {}, {} over {} rooms",
+                set.features, measure.name, all.rooms, fewer.rooms
+            );
+            cases.push(Case::of_trainings(case, &by_training));
+        }
+    }
+    cases
 }
 
-const SCALING_CURVES: [ScalingCurve; 3] = [
-    ScalingCurve {
-        file: "scaling-hits.svg",
-        title: "Zero-shot Hit@0.1",
-        y: "mean over held-out rooms",
-        caption: "Zero-shot Hit@0.1 of inverse Poincaré",
-        of: |run| mean(&run.hit_rates(AFFINE)),
-    },
-    ScalingCurve {
-        file: "scaling-r2.svg",
-        title: "Rooms with R² > 0",
-        y: "share of held-out rooms",
-        caption: "Held-out rooms with R² above 0",
-        of: |run| MotionSummary::of(&run.r2(), 0).map_or(f64::NAN, |r2| r2.positive.rate),
-    },
-    ScalingCurve {
-        file: "scaling-mean.svg",
-        title: "R², negative ones as 0",
-        y: "mean of max(R², 0)",
-        caption: "Mean over held-out rooms of max(R², 0)",
-        of: |run| MotionSummary::of(&run.r2(), 0).map_or(f64::NAN, |r2| r2.clipped_at_zero.mean),
-    },
+/// The mean of a measure over the held-out rooms, for each training.
+fn means_by_training(size: &SizeResults, measure: &Measure) -> Vec<f64> {
+    let of_run = |run: &CrossRoomRun| {
+        let rooms: Vec<f64> = run.outcomes.iter().map(measure.of).collect();
+        mean_of_known(&rooms)
+    };
+    size.runs.iter().map(of_run).collect()
+}
+
+fn scaling_table(results: &[SetResults]) -> Table {
+    let names = MEASURES.map(|measure| measure.name).join(" | ");
+    let mut table = Table::new(&format!(
+        "features | rooms learned from | trainings | {names}"
+    ));
+    for set in results {
+        for size in &set.by_size {
+            let counts = [size.rooms.to_string(), size.runs.len().to_string()];
+            let measures = MEASURES
+                .iter()
+                .map(|measure| spread_text(&means_by_training(size, measure), 3));
+            table.row(&set.features, counts.into_iter().chain(measures));
+        }
+    }
+    table
+}
+
+fn second_visits_table(results: &[SetResults]) -> Table {
+    let mut table = Table::new(
+        "features | navigator | rooms | Hit@0.1 in later visits [95 %] | over zero-shot [95 %]",
+    );
+    for set in results {
+        let run = &set.second_visits;
+        let zero_shot = run.hit_rates(AFFINE);
+        if zero_shot.is_empty() {
+            continue;
+        }
+        for name in ["identity", AFFINE, REFIT_OF_FIRST_VISIT] {
+            let hits = run.hit_rates(name);
+            let over = paired_difference(&hits, &zero_shot, 0);
+            let cells = [
+                name.to_owned(),
+                hits.len().to_string(),
+                room_mean_text(&bootstrap_mean(&hits, 0)),
+                room_difference_text(&over),
+            ];
+            table.row(&set.features, cells);
+        }
+    }
+    table
+}
+
+/// Files and captions of the scaling curves, one per measure.
+const CURVES: [(&str, &str); 3] = [
+    ("scaling-hits.svg", "Zero-shot Hit@0.1 of inverse Poincaré"),
+    ("scaling-r2.svg", "Share of held-out rooms with R² above 0"),
+    ("scaling-mean.svg", "Mean over held-out rooms of max(R², 0)"),
 ];
 
 fn add_curves(section: &mut Section, results: &[SetResults]) -> Result<(), Error> {
-    for curve in &SCALING_CURVES {
+    for ((file, caption), measure) in CURVES.iter().zip(&MEASURES) {
         let line = |set: &SetResults| {
             let sizes = set.by_size.iter();
-            let points = sizes.map(|result| [result.plan.rooms as f64, (curve.of)(&result.run)]);
+            let points = sizes.map(|size| {
+                let value = mean_of_known(&means_by_training(size, measure));
+                [size.rooms as f64, value]
+            });
             Series::line(&set.features, points.collect())
         };
         let lines = results.iter().map(line).collect();
-        let figure = Figure::new(curve.title, "rooms learned from", curve.y, lines);
-
-        let caption = format!("{} by how many rooms were learned from", curve.caption);
-        section.picture(curve.file, figure.svg()?, caption);
+        let figure = Figure::new(*caption, "rooms learned from", measure.name, lines);
+        let caption = format!("{caption} by how many rooms were learned from");
+        section.picture(*file, figure.svg()?, caption);
     }
 
     Ok(())

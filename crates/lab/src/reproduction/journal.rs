@@ -1,23 +1,29 @@
-//! Keeps what a run has finished, so that an interrupted run goes on from there.
+//! Keeps what a run has finished, so that another run with the same inputs reuses it.
 
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
+use serde_json::{Value, json};
+use sha2::{Digest, Sha256};
 
-use super::{Claim, Found, ReproducedAdapter};
+use super::{Claim, Found, ReproducedAdapter, Reproduction};
 use crate::experiments::Error;
 use crate::report::Section;
 use seese3_core::adapter::{Adapter, TrainingRecord};
+use seese3_core::training::RoomData;
 
-/// The finished steps and the trained adapters of a run. Errors are reasons, in words.
+/// Number of bytes of a hash of inputs in the name of a kept adapter.
+const HASH_BYTES: usize = 8;
+
+/// The finished parts and the trained adapters of runs. Errors are reasons, in words.
 pub trait Journal: Sync {
-    /// A finished step; `None` if it is not finished.
-    fn step(&self, name: &str) -> Result<Option<Value>, String>;
-    /// Keeps a finished step.
-    fn keep_step(&self, name: &str, step: &Value) -> Result<(), String>;
-    /// A trained adapter by its published name; `None` if it is not trained.
+    /// A finished part; `None` if it is not finished.
+    fn part(&self, name: &str) -> Result<Option<Value>, String>;
+    /// Keeps a finished part, instead of an older one with its name.
+    fn keep_part(&self, name: &str, part: &Value) -> Result<(), String>;
+    /// A trained adapter by the name it was kept under; `None` if it is not trained.
     fn adapter(&self, name: &str) -> Result<Option<(Adapter, TrainingRecord)>, String>;
-    /// Keeps a trained adapter.
-    fn keep_adapter(&self, adapter: &ReproducedAdapter) -> Result<(), String>;
+    /// Keeps a trained adapter under a name of the journal.
+    fn keep_adapter(&self, name: &str, adapter: &ReproducedAdapter) -> Result<(), String>;
 }
 
 /// A journal that keeps nothing.
@@ -25,11 +31,11 @@ pub trait Journal: Sync {
 pub struct NoJournal;
 
 impl Journal for NoJournal {
-    fn step(&self, _: &str) -> Result<Option<Value>, String> {
+    fn part(&self, _: &str) -> Result<Option<Value>, String> {
         Ok(None)
     }
 
-    fn keep_step(&self, _: &str, _: &Value) -> Result<(), String> {
+    fn keep_part(&self, _: &str, _: &Value) -> Result<(), String> {
         Ok(())
     }
 
@@ -37,12 +43,19 @@ impl Journal for NoJournal {
         Ok(None)
     }
 
-    fn keep_adapter(&self, _: &ReproducedAdapter) -> Result<(), String> {
+    fn keep_adapter(&self, _: &str, _: &ReproducedAdapter) -> Result<(), String> {
         Ok(())
     }
 }
 
-/// A finished step as it is kept.
+/// A finished part as it is kept, with everything that it depends on.
+#[derive(Serialize, Deserialize)]
+struct Kept<T> {
+    inputs: Value,
+    result: T,
+}
+
+/// The result of a step.
 #[derive(Serialize, Deserialize)]
 struct Step {
     section: Section,
@@ -50,47 +63,99 @@ struct Step {
     claims: Vec<Claim>,
 }
 
-/// Runs the steps that are not kept yet.
-pub(super) struct Kept<'a> {
-    pub journal: &'a dyn Journal,
-    /// Called with the name of a step before it.
-    pub begin: &'a dyn Fn(&'static str),
-}
+impl Reproduction<'_> {
+    /// The inputs of a part: the program's version, the given options, and the rooms with their
+    /// revisions and features.
+    pub(super) fn inputs(&self, options: Value, rooms: &[&[RoomData<'_>]]) -> Value {
+        let names = |rooms: &&[RoomData<'_>]| -> Vec<String> {
+            let room = |data: &RoomData<'_>| {
+                let source = data.features.source();
+                format!("{} {} {source:?}", data.room.id(), data.revision)
+            };
+            rooms.iter().map(room).collect()
+        };
+        json!({
+            "version": env!("CARGO_PKG_VERSION"),
+            "epochs_instead_of_the_presets": self.options.epochs,
+            "options": options,
+            "rooms": rooms.iter().map(names).collect::<Vec<_>>(),
+        })
+    }
 
-impl Kept<'_> {
-    /// The result of a step: the kept one, else that of `run`, which is then kept. Adds the claims
-    /// of the step to `claims`.
-    pub fn step<R: Serialize>(
+    /// The result of a part: the kept one if it has the same inputs, else that of `run`, which is
+    /// then kept.
+    pub(super) fn kept<T: Serialize + DeserializeOwned>(
         &self,
-        name: &'static str,
+        name: &str,
+        inputs: Value,
+        run: impl FnOnce() -> Result<T, Error>,
+    ) -> Result<T, Error> {
+        let failed =
+            |problem: serde_json::Error| Error::Journal(format!("part '{name}': {problem}"));
+        if let Some(kept) = self.journal.part(name).map_err(Error::Journal)?
+            && kept.get("inputs") == Some(&inputs)
+        {
+            let kept: Kept<T> = serde_json::from_value(kept).map_err(failed)?;
+            return Ok(kept.result);
+        }
+
+        let kept = Kept {
+            inputs,
+            result: run()?,
+        };
+        let value = serde_json::to_value(&kept).map_err(failed)?;
+        self.journal
+            .keep_part(name, &value)
+            .map_err(Error::Journal)?;
+        Ok(kept.result)
+    }
+
+    /// The result of a step with a section of its own. Adds the claims of the step to `claims`.
+    pub(super) fn step<R: Serialize>(
+        &self,
+        name: &str,
+        inputs: Value,
         claims: &mut Vec<Claim>,
         run: impl FnOnce(&mut Vec<Claim>) -> Result<Found<R>, Error>,
     ) -> Result<Found<Value>, Error> {
-        (self.begin)(name);
-        let failed =
-            |problem: serde_json::Error| Error::Journal(format!("step '{name}': {problem}"));
-        let kept = self.journal.step(name).map_err(Error::Journal)?;
-        let step: Step = match kept {
-            Some(step) => serde_json::from_value(step).map_err(failed)?,
-            None => {
-                let mut own = Vec::new();
-                let Found { section, record } = run(&mut own)?;
-                let step = Step {
-                    section,
-                    record: serde_json::to_value(record).map_err(failed)?,
-                    claims: own,
-                };
-                let value = serde_json::to_value(&step).map_err(failed)?;
-                self.journal
-                    .keep_step(name, &value)
-                    .map_err(Error::Journal)?;
-                step
-            }
-        };
+        let step = self.kept(name, inputs, || {
+            let mut own = Vec::new();
+            let Found { section, record } = run(&mut own)?;
+            let record = serde_json::to_value(record)
+                .map_err(|problem| Error::Journal(format!("part '{name}': {problem}")))?;
+            Ok(Step {
+                section,
+                record,
+                claims: own,
+            })
+        })?;
         claims.extend(step.claims);
         Ok(Found {
             section: step.section,
             record: step.record,
         })
+    }
+
+    /// The adapter of `what`, a room or a plan: the kept one if it has the same inputs, else that
+    /// of `train`, which is then kept. `data` is a room with the adapter's features.
+    pub(super) fn trained(
+        &self,
+        what: &str,
+        inputs: &Value,
+        data: &RoomData<'_>,
+        train: impl FnOnce() -> Result<(Adapter, TrainingRecord), Error>,
+    ) -> Result<ReproducedAdapter, Error> {
+        let hash = Sha256::digest(inputs.to_string());
+        let name = format!("kept-{}", hex::encode(&hash[..HASH_BYTES]));
+        if let Some((adapter, record)) = self.journal.adapter(&name).map_err(Error::Journal)? {
+            return Ok(ReproducedAdapter::new(what, data, adapter, record));
+        }
+
+        let (adapter, record) = train()?;
+        let adapter = ReproducedAdapter::new(what, data, adapter, record);
+        self.journal
+            .keep_adapter(&name, &adapter)
+            .map_err(Error::Journal)?;
+        Ok(adapter)
     }
 }

@@ -8,6 +8,7 @@ mod claims;
 mod cross;
 mod formulations;
 mod journal;
+mod layers;
 mod navigation;
 mod notes;
 mod paper;
@@ -17,19 +18,19 @@ mod probes;
 mod settings;
 mod strides;
 mod success;
-
-use journal::Kept;
+mod walks;
 
 pub use claims::{Claim, Verdict};
 pub use journal::{Journal, NoJournal};
+pub use layers::LayerSet;
 pub use notes::{Notes, ReproducedAdapter, published_name};
 
 use std::collections::BTreeSet;
 
 use serde::Serialize;
-use serde_json::Value;
+use serde_json::{Value, json};
 
-use seese3_core::adapter::{Adapter, Preset, TrainingRecord};
+use seese3_core::adapter::Preset;
 use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
 use seese3_core::room::{FrameId, Room};
@@ -49,6 +50,8 @@ pub struct Options {
     pub strides: Vec<u32>,
     /// Numbers of training rooms along the scaling curve.
     pub sizes: Vec<usize>,
+    /// Number of trainings of every size, with seeds from 0.
+    pub trainings: u64,
     /// Number of training rooms that plans with calibration use for calibration instead.
     #[serde(rename = "aside")]
     pub calibration_rooms: usize,
@@ -56,6 +59,8 @@ pub struct Options {
     pub seeds: u64,
     /// Number of seeds in the table of the alternatives A to D; the paper uses 15.
     pub formulation_seeds: u64,
+    /// Epochs of the long training of the alternatives A to D, 200 in the paper; 0 leaves it out.
+    pub formulation_epochs: usize,
     /// Number of epochs that overrides every preset, for a trial run.
     #[serde(rename = "epochs_instead_of_the_presets")]
     pub epochs: Option<usize>,
@@ -79,9 +84,11 @@ pub struct Reproduction<'a> {
     pub options: Options,
     /// One entry per feature set, the control last; each has the same rooms.
     pub sets: Vec<FeatureSet<'a>>,
+    /// Layers of an encoder to compare, in the rooms that are learned alone.
+    pub layers: Vec<LayerSet<'a>>,
     /// Reads images for the pictures of walks; this crate reads no files.
     pub images: Images<'a>,
-    /// Keeps what is finished, so that an interrupted run goes on from there.
+    /// Keeps what is finished, so that another run with the same inputs reuses it.
     pub journal: &'a dyn Journal,
 }
 
@@ -110,12 +117,14 @@ pub struct Reproduced {
 pub struct ReproductionRecord {
     probes: Value,
     strides: Value,
+    layers: Value,
     rooms_alone: Value,
     settings: Value,
     formulations: Value,
     navigation: Vec<navigation::NavigationRecord>,
     cross_room: Vec<cross::ZeroShotRecord>,
     better: Vec<better::BetterRecord>,
+    walks: Vec<walks::WalkEndRecord>,
     pictures: Vec<pictures::WalkRecord>,
     theory: Value,
     claims: Vec<Claim>,
@@ -134,7 +143,7 @@ struct ProtocolRecord {
 }
 
 /// Number of experiments run by [`reproduce`].
-pub const EXPERIMENTS: u64 = 10;
+pub const EXPERIMENTS: u64 = 12;
 
 /// The result of an experiment: a section of the report, and its JSON record.
 struct Found<R> {
@@ -167,12 +176,10 @@ pub fn check(given: &Reproduction<'_>) -> Result<(), Error> {
         let Options {
             stride, strides, ..
         } = &given.options;
-        has_pairs_in_every_fold(
-            &set.in_room,
-            "--in-room",
-            &[&strides[..], &[*stride]].concat(),
-        )?;
-        has_pairs_in_every_fold(&set.test, "--test", &[*stride])?;
+        let all_strides = [&strides[..], &[*stride]].concat();
+        has_pairs(&set.in_room, "--in-room", &Split::FOLDS, &all_strides)?;
+        has_pairs(&set.in_room, "--in-room", &[Split::Blocks], &[*stride])?;
+        has_pairs(&set.test, "--test", &Split::FOLDS, &[*stride])?;
     }
     let rooms = given.sets.first().map_or(0, |set| set.train.len());
     let is_out_of_range = |size: &&usize| **size == 0 || **size > rooms;
@@ -192,16 +199,17 @@ pub fn check(given: &Reproduction<'_>) -> Result<(), Error> {
     Ok(())
 }
 
-/// Checks that every recording has training and test pairs in every fold, at each stride.
-fn has_pairs_in_every_fold(
+/// Checks that every recording has training and test pairs under every split, at each stride.
+fn has_pairs(
     rooms: &[RoomData<'_>],
     option: &str,
+    splits: &[Split],
     strides: &[u32],
 ) -> Result<(), Error> {
     for data in rooms {
         let timeline = data.room.timeline();
         for &stride in strides {
-            for split in Split::FOLDS {
+            for split in splits {
                 let pairs = split
                     .train_pairs(timeline, stride)
                     .and_then(|_| split.test_pairs(timeline, stride));
@@ -230,8 +238,8 @@ pub fn adapter_names(given: &Reproduction<'_>) -> Vec<String> {
 
 /// Runs the paper's experiments. `begin` is called with the name of each before it.
 ///
-/// What the journal of `given` has is not run again: finished experiments that train adapters of
-/// their own alone, and the adapters of the others.
+/// What the journal of `given` has with the same inputs is not run again: the steps that use no
+/// adapter of another step, and the trained adapters.
 ///
 /// # Errors
 /// The [`Error`] of [`check`] or of the first failed experiment; [`Error::Journal`] if the journal
@@ -243,18 +251,7 @@ pub fn reproduce(
     check(given)?;
 
     let mut notes = Notes::default();
-    let claims = &mut notes.claims;
-    let kept = Kept {
-        journal: given.journal,
-        begin,
-    };
-    let probes = kept.step("probes", claims, |claims| probes::section(given, claims))?;
-    let strides = kept.step("strides", claims, |claims| strides::section(given, claims))?;
-    let rooms_alone = kept.step("rooms-alone", claims, |_| success::section(given))?;
-    let settings = kept.step("settings", claims, |_| settings::section(given))?;
-    let formulations = kept.step("formulations", claims, |claims| {
-        formulations::section(given, claims)
-    })?;
+    let within = within_rooms(given, begin, &mut notes.claims)?;
     begin("navigation");
     let navigation = navigation::section(given, &mut notes)?;
 
@@ -265,36 +262,48 @@ pub fn reproduce(
     begin("better");
     let better = better::section(&across, &mut notes.claims);
 
-    // The walks use the steady adapter trained for the previous sections.
+    // The walks use the steady adapters trained for the previous sections.
+    begin("walks");
+    let mut claims = Vec::new();
+    let walks = walks::section(given, &notes, &mut claims)?;
+    notes.claims.extend(claims);
     begin("pictures");
     let pictures = pictures::section(given, &notes)?;
-    let theory = kept.step("theory", &mut notes.claims, |_| theory())?;
+    begin("theory");
+    let inputs = given.inputs(Value::Null, &[]);
+    let theory = given.step("theory", inputs, &mut notes.claims, |_| theory())?;
 
+    // The tests are complete only now.
+    claims::judge(&mut notes.claims);
     // The verdicts are complete only now; place them near the top of the report, after the rooms.
     let mut sections = vec![rooms_and_features(given), claims::section(&notes.claims)];
     sections.extend([
-        probes.section,
-        strides.section,
-        rooms_alone.section,
-        settings.section,
-        formulations.section,
+        within.probes.section,
+        within.strides.section,
+        within.layers.section,
+        within.rooms_alone.section,
+        within.settings.section,
+        within.formulations.section,
         navigation.section,
         cross_room.section,
         better.section,
+        walks.section,
         pictures.section,
         theory.section,
         published(&notes),
     ]);
 
     let record = ReproductionRecord {
-        probes: probes.record,
-        strides: strides.record,
-        rooms_alone: rooms_alone.record,
-        settings: settings.record,
-        formulations: formulations.record,
+        probes: within.probes.record,
+        strides: within.strides.record,
+        layers: within.layers.record,
+        rooms_alone: within.rooms_alone.record,
+        settings: within.settings.record,
+        formulations: within.formulations.record,
         navigation: navigation.record,
         cross_room: cross_room.record,
         better: better.record,
+        walks: walks.record,
         pictures: pictures.record,
         theory: theory.record,
         claims: notes.claims,
@@ -311,28 +320,77 @@ pub fn reproduce(
     })
 }
 
+/// The steps within a room, which train adapters of their own alone.
+struct WithinRooms {
+    probes: Found<Value>,
+    strides: Found<Value>,
+    layers: Found<Value>,
+    rooms_alone: Found<Value>,
+    settings: Found<Value>,
+    formulations: Found<Value>,
+}
+
+fn within_rooms(
+    given: &Reproduction<'_>,
+    begin: &dyn Fn(&'static str),
+    claims: &mut Vec<Claim>,
+) -> Result<WithinRooms, Error> {
+    let Options {
+        stride,
+        strides,
+        seeds,
+        formulation_seeds,
+        formulation_epochs,
+        ..
+    } = &given.options;
+    let alone: Vec<&[RoomData<'_>]> = given.sets.iter().map(|set| &*set.in_room).collect();
+    let held_out: Vec<&[RoomData<'_>]> = given.sets.iter().map(|set| &*set.test).collect();
+    let all = [&alone[..], &held_out[..]].concat();
+    let layers: Vec<&[RoomData<'_>]> = given.layers.iter().map(|layer| &*layer.rooms).collect();
+
+    begin("probes");
+    let inputs = given.inputs(json!({ "stride": stride }), &all);
+    let probes = given.step("probes", inputs, claims, |claims| {
+        probes::section(given, claims)
+    })?;
+    begin("strides");
+    let inputs = given.inputs(json!({ "strides": strides, "seeds": seeds }), &alone);
+    let strides_found = given.step("strides", inputs, claims, |claims| {
+        strides::section(given, claims)
+    })?;
+    begin("layers");
+    let inputs = given.inputs(json!({ "stride": stride, "seeds": seeds }), &layers);
+    let layers = given.step("layers", inputs, claims, |_| layers::section(given))?;
+    begin("rooms-alone");
+    let inputs = given.inputs(json!({ "strides": strides, "seeds": seeds }), &all);
+    let rooms_alone = given.step("rooms-alone", inputs, claims, |claims| {
+        success::section(given, claims)
+    })?;
+    begin("settings");
+    let inputs = given.inputs(json!({ "stride": stride, "seeds": seeds }), &alone);
+    let settings = given.step("settings", inputs, claims, |claims| {
+        settings::section(given, claims)
+    })?;
+    begin("formulations");
+    let inputs = given.inputs(
+        json!({ "stride": stride, "seeds": formulation_seeds, "epochs": formulation_epochs }),
+        &alone,
+    );
+    let formulations = given.step("formulations", inputs, claims, |claims| {
+        formulations::section(given, claims)
+    })?;
+
+    Ok(WithinRooms {
+        probes,
+        strides: strides_found,
+        layers,
+        rooms_alone,
+        settings,
+        formulations,
+    })
+}
+
 impl Reproduction<'_> {
-    /// The adapter of `what`, a room or a plan: the kept one, else that of `train`, which is then
-    /// kept.
-    fn trained(
-        &self,
-        what: &str,
-        data: &RoomData<'_>,
-        train: impl FnOnce() -> Result<(Adapter, TrainingRecord), Error>,
-    ) -> Result<ReproducedAdapter, Error> {
-        let name = published_name(what, &data.features.source().name);
-        if let Some((adapter, record)) = self.journal.adapter(&name).map_err(Error::Journal)? {
-            return Ok(ReproducedAdapter::new(what, data, adapter, record));
-        }
-
-        let (adapter, record) = train()?;
-        let adapter = ReproducedAdapter::new(what, data, adapter, record);
-        self.journal
-            .keep_adapter(&adapter)
-            .map_err(Error::Journal)?;
-        Ok(adapter)
-    }
-
     /// The training plan of a preset at a stride. The number of epochs is the command's `--epochs`,
     /// else `epochs`, else the preset's own. Only the last has a minimum number of steps.
     fn plan(

@@ -56,11 +56,10 @@ pub fn published_name(what: &str, features: &str) -> String {
 
 impl Notes {
     /// The adapter of `what` with these features, if this run trained it.
-    pub fn adapter(&self, what: &str, features: &str) -> Option<&Adapter> {
+    pub fn reproduced(&self, what: &str, features: &str) -> Option<&ReproducedAdapter> {
         let name = published_name(what, features);
         self.adapters
             .iter()
             .find(|reproduced| reproduced.name == name)
-            .map(|reproduced| &reproduced.adapter)
     }
 }

@@ -1,11 +1,15 @@
 //! The adapters of the cross-room sections: training plans, numbers of rooms, and results in the
 //! held-out rooms.
 
+use std::collections::BTreeMap;
+
 use rayon::prelude::*;
+use serde_json::json;
 
 use seese3_core::adapter::{Mixing, Preset, Reading};
 use seese3_core::eval::Protocol;
 use seese3_core::navigation::{NavigatorKind, Refit, RetrievalMetric, StepKind};
+use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan};
 
@@ -86,12 +90,14 @@ impl PlanKind {
 }
 
 /// One adapter to train and to evaluate in the held-out rooms.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct AdapterPlan {
     /// The kind of adapter.
     pub kind: PlanKind,
     /// Number of rooms, including calibration rooms.
     pub rooms: usize,
+    /// Seed of the choice of the rooms and of the training.
+    pub seed: u64,
 }
 
 impl AdapterPlan {
@@ -109,18 +115,29 @@ pub struct PlanResult {
     pub run: CrossRoomRun,
 }
 
+/// Several trainings of the paper's preset on one number of rooms.
+pub struct SizeResults {
+    /// The number of rooms.
+    pub rooms: usize,
+    /// One run per seed, from 0.
+    pub runs: Vec<CrossRoomRun>,
+}
+
 /// The results of all plans with one feature set.
 pub struct SetResults {
     /// The name of the features.
     pub features: String,
-    /// Results of the plans on all rooms, the paper's preset first.
+    /// Results of the plans on all rooms with seed 0, the paper's preset first.
     pub on_all_rooms: Vec<PlanResult>,
     /// Results of the paper's preset, by increasing number of rooms.
-    pub by_size: Vec<PlanResult>,
+    pub by_size: Vec<SizeResults>,
+    /// Results of the paper's preset on all rooms, in the second visits of the held-out rooms that
+    /// have several; refits there are fitted on the first visit.
+    pub second_visits: CrossRoomRun,
 }
 
 impl SetResults {
-    /// The baseline of all comparisons: the paper's preset on all rooms.
+    /// The baseline of all comparisons: the paper's preset on all rooms, seed 0.
     pub fn baseline(&self) -> &PlanResult {
         &self.on_all_rooms[0]
     }
@@ -131,76 +148,98 @@ pub fn steady_adapter(set: &FeatureSet<'_>) -> String {
     let plan = AdapterPlan {
         kind: PlanKind::Steady,
         rooms: set.train.len(),
+        seed: 0,
     };
     plan.adapter_name()
 }
 
 /// Trains the adapters of every plan and feature set, and evaluates them in the held-out rooms.
 pub fn evaluate(given: &Reproduction<'_>, notes: &mut Notes) -> Result<Vec<SetResults>, Error> {
-    let mut all = Vec::with_capacity(given.sets.len());
-    for set in &given.sets {
-        let rooms = set.train.len();
-        let results: Vec<(PlanResult, ReproducedAdapter)> = plans(given, set)
-            .into_par_iter()
-            .map(|plan| result_of(given, set, plan))
-            .collect::<Result<_, Error>>()?;
-        let (results, adapters): (Vec<PlanResult>, Vec<ReproducedAdapter>) =
-            results.into_iter().unzip();
-        notes.adapters.extend(adapters);
+    given
+        .sets
+        .iter()
+        .map(|set| evaluate_set(given, set, notes))
+        .collect()
+}
 
-        let mut by_size: Vec<PlanResult> = Vec::new();
-        let mut on_all_rooms = Vec::new();
-        for result in results {
-            if result.plan.kind == PlanKind::PaperRange {
-                by_size.push(PlanResult {
-                    plan: result.plan,
-                    run: result.run.clone(),
-                });
-            }
-            if result.plan.rooms == rooms {
+fn evaluate_set(
+    given: &Reproduction<'_>,
+    set: &FeatureSet<'_>,
+    notes: &mut Notes,
+) -> Result<SetResults, Error> {
+    let results: Vec<(PlanResult, ReproducedAdapter)> = plans(given, set)
+        .into_par_iter()
+        .map(|plan| result_of(given, set, plan))
+        .collect::<Result<_, Error>>()?;
+
+    let is_baseline = |plan: &AdapterPlan| {
+        plan.kind == PlanKind::PaperRange && plan.rooms == set.train.len() && plan.seed == 0
+    };
+    let baseline = results.iter().find(|(result, _)| is_baseline(&result.plan));
+    let Some((_, baseline)) = baseline else {
+        return Err(Error::Input("there is no room to train on".to_owned()));
+    };
+    let second_visits = in_second_visits(given, set, baseline)?;
+
+    let mut by_size: BTreeMap<usize, Vec<CrossRoomRun>> = BTreeMap::new();
+    let mut on_all_rooms = Vec::new();
+    for (result, adapter) in results {
+        let plan = result.plan;
+        if plan.kind == PlanKind::PaperRange {
+            let runs = by_size.entry(plan.rooms).or_default();
+            runs.push(result.run.clone());
+        }
+        // The other seeds show the spread of a training; their adapters are not published.
+        if plan.seed == 0 {
+            notes.adapters.push(adapter);
+            if plan.rooms == set.train.len() {
                 on_all_rooms.push(result);
             }
         }
-
-        // The paper's preset comes first; the others keep the order of the plans.
-        on_all_rooms.sort_by_key(|result| result.plan.kind != PlanKind::PaperRange);
-        by_size.sort_by_key(|result| result.plan.rooms);
-        all.push(SetResults {
-            features: set.features.clone(),
-            on_all_rooms,
-            by_size,
-        });
     }
 
-    Ok(all)
+    // The paper's preset comes first; the others keep the order of the plans.
+    on_all_rooms.sort_by_key(|result| result.plan.kind != PlanKind::PaperRange);
+    let by_size = by_size.into_iter().map(|(rooms, mut runs)| {
+        runs.sort_by_key(|run| run.seed);
+        SizeResults { rooms, runs }
+    });
+    Ok(SetResults {
+        features: set.features.clone(),
+        on_all_rooms,
+        by_size: by_size.collect(),
+        second_visits,
+    })
 }
 
 /// All plans, longest training first, so that no long training runs alone at the end.
 fn plans(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Vec<AdapterPlan> {
     let all = set.train.len();
-    let on_all_rooms = [
-        PlanKind::PaperRange,
-        PlanKind::PaperRangeCalibrated,
-        PlanKind::EnsembleCalibrated,
+    let on_all_rooms = |kind| AdapterPlan {
+        kind,
+        rooms: all,
+        seed: 0,
+    };
+    let mut plans = vec![
+        on_all_rooms(PlanKind::PaperRangeCalibrated),
+        on_all_rooms(PlanKind::EnsembleCalibrated),
     ];
-    let mut plans: Vec<AdapterPlan> = on_all_rooms
-        .map(|kind| AdapterPlan { kind, rooms: all })
-        .to_vec();
 
-    // The scaling curve of the paper's preset. Its last point, all rooms, is already in the list.
+    // The scaling curve of the paper's preset. All rooms are its last point, listed or not.
     let mut sizes = given.options.sizes.clone();
-    sizes.retain(|&size| size != all);
+    sizes.push(all);
     sizes.sort_unstable();
     sizes.dedup();
-    plans.extend(sizes.into_iter().rev().map(|rooms| AdapterPlan {
-        kind: PlanKind::PaperRange,
-        rooms,
-    }));
+    for rooms in sizes.into_iter().rev() {
+        plans.extend((0..given.options.trainings).map(|seed| AdapterPlan {
+            kind: PlanKind::PaperRange,
+            rooms,
+            seed,
+        }));
+    }
 
     // Preset steady needs only a fraction of the steps.
-    let steady = [PlanKind::Steady, PlanKind::SteadyCalibrated];
-    plans.extend(steady.map(|kind| AdapterPlan { kind, rooms: all }));
-
+    plans.extend([PlanKind::Steady, PlanKind::SteadyCalibrated].map(on_all_rooms));
     plans
 }
 
@@ -209,7 +248,7 @@ fn result_of(
     set: &FeatureSet<'_>,
     plan: AdapterPlan,
 ) -> Result<(PlanResult, ReproducedAdapter), Error> {
-    let rooms: Vec<RoomData<'_>> = nested_choice(plan.rooms, set.train.len(), 0)
+    let rooms: Vec<RoomData<'_>> = nested_choice(plan.rooms, set.train.len(), plan.seed)
         .into_iter()
         .map(|room| set.train[room])
         .collect();
@@ -223,43 +262,111 @@ fn result_of(
     let protocol = Protocol {
         split: Split::Whole,
         thresholds: vec![0.1],
-        navigators: navigators(calibration_rooms > 0),
+        navigators: navigators(&plan),
         ..Protocol::paper(given.options.stride)
     };
 
-    let training = training_plan(given, plan.kind);
+    let training = training_plan(given, plan);
     let training = CrossRoomPlan {
         training: &training,
         relational: None,
         calibration_rooms,
         protocol: &protocol,
     };
-    let progress = CrossRoomProgress {
-        epoch: &|| (),
-        room: &|| (),
-    };
 
-    let adapter = given.trained(&plan.adapter_name(), &set.train[0], || {
-        train_and_calibrate(&rooms, &training, &progress)
+    let options = json!({
+        "training": format!("{:?}", training.training),
+        "calibration_rooms": calibration_rooms,
+    });
+    let inputs = given.inputs(options, &[&rooms]);
+    let adapter = given.trained(&plan.adapter_name(), &inputs, &set.train[0], || {
+        train_and_calibrate(&rooms, &training, &SILENT)
     })?;
     let trained = (adapter.adapter.clone(), adapter.record.clone());
-    let run = test_trained(trained, &rooms, &set.test, &training, &progress)?.run;
+    let run = test_trained(trained, &rooms, &set.test, &training, &SILENT)?.run;
     Ok((PlanResult { plan, run }, adapter))
 }
 
-fn training_plan(given: &Reproduction<'_>, kind: PlanKind) -> TrainingPlan {
+const SILENT: CrossRoomProgress<'static> = CrossRoomProgress {
+    epoch: &|| (),
+    room: &|| (),
+};
+
+/// Evaluates an adapter in the held-out rooms with several sequences: refits are fitted on the
+/// first sequence; pairs and candidates are of the others. Rooms with one sequence are skipped.
+fn in_second_visits(
+    given: &Reproduction<'_>,
+    set: &FeatureSet<'_>,
+    adapter: &ReproducedAdapter,
+) -> Result<CrossRoomRun, Error> {
+    let views: Vec<Room> = set
+        .test
+        .iter()
+        .map(|data| first_visit_learned(data.room))
+        .collect::<Result<_, _>>()?;
+    let held_out: Vec<RoomData<'_>> = set
+        .test
+        .iter()
+        .zip(&views)
+        .filter(|(_, view)| view.timeline().held_out.contains(&true))
+        .map(|(data, room)| RoomData { room, ..*data })
+        .collect();
+
+    let affine = StepKind::InversePoincare(Reading::Affine);
+    let refit = StepKind::Refit(Refit {
+        z_scored: true,
+        intercept: false,
+        in_sample: false,
+    });
+    let protocol = Protocol {
+        split: Split::Dataset,
+        thresholds: vec![0.1],
+        navigators: vec![
+            NavigatorKind::Identity,
+            NavigatorKind::Step(affine, RetrievalMetric::Full),
+            NavigatorKind::Step(refit, RetrievalMetric::Full),
+        ],
+        ..Protocol::paper(given.options.stride)
+    };
+    let plan = AdapterPlan {
+        kind: PlanKind::PaperRange,
+        rooms: set.train.len(),
+        seed: 0,
+    };
+    let plan = CrossRoomPlan {
+        training: &training_plan(given, plan),
+        relational: None,
+        calibration_rooms: 0,
+        protocol: &protocol,
+    };
+    let trained = (adapter.adapter.clone(), adapter.record.clone());
+    Ok(test_trained(trained, &set.train, &held_out, &plan, &SILENT)?.run)
+}
+
+/// The room with all sequences but the first held out.
+fn first_visit_learned(room: &Room) -> Result<Room, Error> {
+    let mut frames = room.frames().clone();
+    let first = FrameId(0);
+    frames.held_out = (0..room.frame_count() as u32)
+        .map(|row| !room.timeline().joins(first, FrameId(row)))
+        .collect();
+    Room::new(room.id().clone(), frames, room.provenance().clone())
+        .map_err(|problem| Error::Input(problem.to_string()))
+}
+
+fn training_plan(given: &Reproduction<'_>, of: AdapterPlan) -> TrainingPlan {
     let stride = given.options.stride;
-    let mut plan = given.plan(kind.preset(), Split::Whole, stride, 0, None);
+    let mut plan = given.plan(of.kind.preset(), Split::Whole, stride, of.seed, None);
 
     // Members of an ensemble share one adapter's epochs; a single adapter is an ensemble of one.
-    plan.config.charts = kind.members();
+    plan.config.charts = of.kind.members();
     plan.config.mixing = Mixing::Even;
     plan
 }
 
 /// The navigators of the cross-room tables. Calibrated retrieval needs the error covariance from
-/// calibration rooms.
-fn navigators(is_calibrated: bool) -> Vec<NavigatorKind> {
+/// calibration rooms. The other seeds are for the scaling curve alone.
+fn navigators(plan: &AdapterPlan) -> Vec<NavigatorKind> {
     let affine = StepKind::InversePoincare(Reading::Affine);
     let homogeneous = StepKind::InversePoincare(Reading::Homogeneous);
     let refit = |z_scored: bool| {
@@ -273,13 +380,18 @@ fn navigators(is_calibrated: bool) -> Vec<NavigatorKind> {
     let mut navigators = vec![
         NavigatorKind::Identity,
         NavigatorKind::Step(affine, RetrievalMetric::Full),
+    ];
+    if plan.seed != 0 {
+        return navigators;
+    }
+    navigators.extend([
         NavigatorKind::Step(homogeneous, RetrievalMetric::Full),
         NavigatorKind::Step(refit(true), RetrievalMetric::Full),
         NavigatorKind::Step(refit(false), RetrievalMetric::Full),
         NavigatorKind::Step(affine, RetrievalMetric::RowSpace),
         NavigatorKind::Step(affine, RetrievalMetric::Whitened),
-    ];
-    if is_calibrated {
+    ]);
+    if plan.kind.is_calibrated() {
         let calibrated = NavigatorKind::Step(homogeneous, RetrievalMetric::Calibrated);
         navigators.push(calibrated);
     }

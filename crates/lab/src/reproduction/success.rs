@@ -1,6 +1,8 @@
 //! Section: one adapter per room with one, two and four charts. It reports the fraction of rooms
 //! where training succeeds, and the difficulty of the rooms.
 
+use std::collections::BTreeMap;
+
 use rayon::prelude::*;
 
 use seese3_core::adapter::Preset;
@@ -8,6 +10,7 @@ use seese3_core::splits::Split;
 use seese3_core::statistics::median;
 use seese3_core::training::RoomData;
 
+use super::claims::{Case, Claim};
 use super::{Error, FeatureSet, Found, Reproduction, paper};
 use crate::experiments::adapter_sweep::{SweepRow, content, row, run};
 use crate::report::{
@@ -19,7 +22,10 @@ const CHARTS: [usize; 3] = [1, 2, 4];
 
 /// Builds the section with the paper's Table 2 and the tables of difficulty, mixtures and parts of
 /// the motion.
-pub fn section(given: &Reproduction<'_>) -> Result<Found<Vec<SweepRow>>, Error> {
+pub fn section(
+    given: &Reproduction<'_>,
+    claims: &mut Vec<Claim>,
+) -> Result<Found<Vec<SweepRow>>, Error> {
     let mut section = Section::new("Each room by itself: success, difficulty, mixtures of charts");
 
     let rows: Vec<SweepRow> = given
@@ -49,6 +55,10 @@ pub fn section(given: &Reproduction<'_>) -> Result<Found<Vec<SweepRow>>, Error> 
     section.text("How hard the recordings are, over all features:");
     section.table(difficulty_table(&rows));
     section.text(
+        "By the number of training pairs, with each stride of a room by itself, over all features:",
+    );
+    section.table(pairs_table(&rows));
+    section.text(
         "How hard they are by what there is to see, over all features: the rooms in three parts by contrast, the median \
          over frames of the standard deviation of the control's columns (of pixels: of an image's brightness):",
     );
@@ -60,12 +70,14 @@ pub fn section(given: &Reproduction<'_>) -> Result<Found<Vec<SweepRow>>, Error> 
 
     section.text("By part of the motion, over all runs:");
     section.table(parts_table(&rows));
+    claims.push(order_of_parts(&rows));
 
     section.text(format!(
-        "{} runs: every room that is held out or learned alone, with K of {CHARTS:?}, strides {:?}, time split, one seed. {} \
-         Choosing a run by its test score flatters it: the means are what to expect.",
+        "{} runs: every room that is held out or learned alone, with K of {CHARTS:?}, strides {:?}, time split, {} seeds \
+         for K = 1 and one for the others. {} Choosing a run by its test score flatters it: the means are what to expect.",
         rows.len(),
         given.options.strides,
+        given.options.seeds,
         given.training_words()
     ));
 
@@ -118,6 +130,88 @@ fn contrast_table(given: &Reproduction<'_>, rows: &[SweepRow]) -> Table {
     table
 }
 
+/// The paper's order of difficulty: rotation is read more often than translation, translation more
+/// often than direction, direction more often than magnitude.
+fn order_of_parts(rows: &[SweepRow]) -> Claim {
+    type Part = fn(&SweepRow) -> Option<f64>;
+    const PARTS: [(&str, Part); 4] = [
+        ("rotation", |row| row.rotation),
+        ("translation", |row| row.translation),
+        ("direction", |row| row.direction),
+        ("magnitude", |row| row.magnitude),
+    ];
+
+    let mut rooms: Vec<&str> = rows.iter().map(|row| &*row.room).collect();
+    rooms.sort_unstable();
+    rooms.dedup();
+
+    let share_above_zero = |room: &str, part: Part| {
+        let scores: Vec<f64> = rows
+            .iter()
+            .filter(|row| row.room == room)
+            .filter_map(part)
+            .collect();
+        let above = scores.iter().filter(|&&r2| r2 > 0.0).count();
+        above as f64 / scores.len() as f64
+    };
+    let shares = |part: Part| -> Vec<f64> {
+        let of_room = |room: &&str| share_above_zero(room, part);
+        rooms.iter().map(of_room).collect()
+    };
+
+    let case = |pair: &[(&str, Part)]| {
+        let [(easier, a), (harder, b)] = [pair[0], pair[1]];
+        let name = format!("{easier} over {harder}");
+        Case::of_difference(name, &shares(a), &shares(b))
+    };
+    Claim::new(
+        "parts of the motion by difficulty: rotation, translation, direction, magnitude",
+        "share of the room's runs with R² > 0 of a part minus that of the next one",
+        PARTS.windows(2).map(case).collect(),
+    )
+}
+
+/// Success by the number of training pairs at one stride.
+fn pairs_table(rows: &[SweepRow]) -> Table {
+    /// First and last number of pairs; the paper speaks of recordings with more than 1,000.
+    const BINS: [(usize, usize); 4] = [(0, 199), (200, 499), (500, 999), (1_000, usize::MAX)];
+
+    let mut table =
+        Table::new("training pairs, about | rooms and strides | % > 0 | median best R²");
+    let mut best: BTreeMap<(&str, u32), (usize, f64)> = BTreeMap::new();
+    for row in rows.iter().filter(|row| row.failure.is_empty()) {
+        // Under the time split, four fifths of the frames train.
+        let pairs = (row.frames * 4 / 5).saturating_sub(row.stride as usize);
+        let entry = best
+            .entry((&row.room, row.stride))
+            .or_insert((pairs, f64::NEG_INFINITY));
+        entry.1 = entry.1.max(row.overall.unwrap_or(f64::NEG_INFINITY));
+    }
+
+    for (low, high) in BINS {
+        let of_bin = best
+            .values()
+            .filter(|(pairs, _)| (low..=high).contains(pairs));
+        let scores: Vec<f64> = of_bin.map(|(_, r2)| *r2).collect();
+        if scores.is_empty() {
+            continue;
+        }
+        let above = scores.iter().filter(|&&r2| r2 > 0.0).count();
+        let range = match high {
+            usize::MAX => format!("{low} and more"),
+            _ => format!("{low} to {high}"),
+        };
+        let cells = [
+            scores.len().to_string(),
+            format!("{:.0}", 100.0 * above as f64 / scores.len() as f64),
+            format!("{:.2}", median(&scores)),
+        ];
+        table.row(range, cells);
+    }
+
+    table
+}
+
 /// The best R² of a room's runs; −∞ if all runs failed.
 fn best_r2(rows: &[SweepRow], room: &str) -> f64 {
     rows.iter()
@@ -146,9 +240,12 @@ fn of_set(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Vec<SweepRow> {
         let mut rows = Vec::new();
         for &stride in &given.options.strides {
             for charts in CHARTS {
-                let mut plan = given.plan(Preset::Base, Split::Time, stride, 0, None);
-                plan.config.charts = charts;
-                rows.push(run(room, &plan, row(room, &content, &plan)));
+                let seeds = if charts == 1 { given.options.seeds } else { 1 };
+                for seed in 0..seeds {
+                    let mut plan = given.plan(Preset::Base, Split::Time, stride, seed, None);
+                    plan.config.charts = charts;
+                    rows.push(run(room, &plan, row(room, &content, &plan)));
+                }
             }
         }
 

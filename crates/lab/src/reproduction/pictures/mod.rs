@@ -24,9 +24,9 @@ pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found<Vec<Walk
     // Pictures use only the first feature set.
     let set = &given.sets[0];
     let adapter = notes
-        .adapter(&steady_adapter(set), &set.features)
+        .reproduced(&steady_adapter(set), &set.features)
         .ok_or_else(|| Error::Input("the steady adapter was not trained".to_owned()))?;
-    let adapter = Arc::new(adapter.clone());
+    let adapter = Arc::new(adapter.adapter.clone());
     section.text(
         "Adapter of preset steady, learned from all rooms that are learned together; it saw no frame of the rooms shown.",
     );
@@ -51,14 +51,10 @@ pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found<Vec<Walk
     let rooms = set.test.iter().chain(&set.in_room);
     let mut real = rooms.filter(|data| !is_drawn(data) && is_unseen(data));
     let real = real.find(has_images);
-    if let Some(data) = real {
-        walks.push(walks::add(
-            &mut section,
-            given,
-            data,
-            &adapter,
-            Length::Middle,
-        )?);
+    for &length in Length::VARIANTS {
+        if let Some(data) = real {
+            walks.push(walks::add(&mut section, given, data, &adapter, length)?);
+        }
     }
     if walks.is_empty() {
         section.text("No such room has images; walks are not shown.");

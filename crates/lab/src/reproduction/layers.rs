@@ -1,0 +1,150 @@
+//! Section: the layers of an encoder, and the oracle layer.
+
+use rayon::prelude::*;
+
+use seese3_core::adapter::Preset;
+use seese3_core::splits::Split;
+use seese3_core::statistics::{mean_of_known, paired_difference};
+use seese3_core::training::RoomData;
+
+use super::{Error, Found, Reproduction};
+use crate::experiments::cross_room::clipped_r2;
+use crate::experiments::layers::{LayerProtocol, LayerScores, score_layer};
+use crate::probes::MutualKnn;
+use crate::report::{Section, Table, fixed, room_difference_text};
+
+/// The single-adapter rooms with the features of one layer.
+pub struct LayerSet<'a> {
+    /// The name of the features.
+    pub features: String,
+    /// The rooms.
+    pub rooms: Vec<RoomData<'a>>,
+}
+
+/// A metric by which a layer is chosen: higher is better.
+struct Metric {
+    name: &'static str,
+    of: fn(&LayerScores) -> f64,
+}
+
+/// The metrics for which the paper shows the best layer.
+const METRICS: [Metric; 3] = [
+    Metric {
+        name: "M1",
+        of: |scores| scores.m1.value,
+    },
+    Metric {
+        name: "M3",
+        of: |scores| clipped_r2(scores.m3.r2),
+    },
+    Metric {
+        name: "M4",
+        of: |scores| clipped_r2(scores.m4.r2),
+    },
+];
+
+/// Builds the section on layers; it is empty if no layers are given.
+pub fn section(given: &Reproduction<'_>) -> Result<Found<Vec<LayerScores>>, Error> {
+    let mut section = Section::new("Layers, and the oracle layer");
+    let mut by_layer: Vec<Vec<LayerScores>> = Vec::new();
+    for layer in &given.layers {
+        let scored = layer.rooms.par_iter().map(|room| scored(given, room));
+        by_layer.push(scored.collect::<Result<_, Error>>()?);
+    }
+
+    if by_layer.is_empty() {
+        section.text("No layers were given (--layers).");
+    } else {
+        section.table(table(&by_layer));
+        section.text(format!(
+            "Means over the {} rooms that are learned alone: M1 with frames spread over the recording, M2 without a gap; M3 \
+             and M4 at stride {}, split {}, as max(R², −1). {}",
+            by_layer[0].len(),
+            given.options.stride,
+            Split::Blocks,
+            given.training_words()
+        ));
+        section.table(oracle_table(&by_layer));
+        section.text(
+            "The paper shows, for each encoder and metric, the layer that is best by the scores that it shows. Here every \
+             second room chooses the layer, and the rooms between score it, beside the layer that is best in those rooms.",
+        );
+    }
+
+    Ok(Found {
+        section,
+        record: by_layer.into_iter().flatten().collect(),
+    })
+}
+
+fn scored(given: &Reproduction<'_>, room: &RoomData<'_>) -> Result<LayerScores, Error> {
+    let frames = MutualKnn::default().frames.min(room.room.frame_count());
+    let spread = (room.room.frame_count().saturating_sub(1)) / frames.saturating_sub(1).max(1);
+    let protocol = LayerProtocol {
+        mutual_knn: MutualKnn {
+            frames,
+            stride: spread.max(1),
+            ..MutualKnn::default()
+        },
+        gap: 0,
+        plan: given.plan(Preset::Base, Split::Blocks, given.options.stride, 0, None),
+        splits: vec![Split::Blocks],
+        seeds: given.options.seeds,
+    };
+    score_layer(room, &protocol)
+}
+
+fn means(layer: &[LayerScores], of: impl Fn(&LayerScores) -> f64) -> f64 {
+    mean_of_known(&layer.iter().map(of).collect::<Vec<f64>>())
+}
+
+fn table(by_layer: &[Vec<LayerScores>]) -> Table {
+    let mut table = Table::new(
+        "features | columns | M1 | TwoNN | MLE | M3 | M4 | of translation | of rotation | sd over seeds",
+    );
+    for layer in by_layer {
+        let numbers = [
+            means(layer, METRICS[0].of),
+            means(layer, |scores| scores.m2.twonn),
+            means(layer, |scores| scores.m2.mle),
+            means(layer, METRICS[1].of),
+            means(layer, METRICS[2].of),
+            means(layer, |scores| clipped_r2(scores.m4.translation)),
+            means(layer, |scores| clipped_r2(scores.m4.rotation)),
+            means(layer, |scores| scores.m4.deviation),
+        ];
+        let columns = std::iter::once(layer[0].dim.to_string());
+        table.row(&layer[0].features, columns.chain(fixed(numbers, 3)));
+    }
+    table
+}
+
+/// Every second room chooses the layer of each metric; the rooms between score it.
+fn oracle_table(by_layer: &[Vec<LayerScores>]) -> Table {
+    let mut table = Table::new(
+        "metric | layer chosen in other rooms | score | best layer there | score | best minus chosen [95 %]",
+    );
+    for metric in &METRICS {
+        let values = |layer: &[LayerScores], first: usize| -> Vec<f64> {
+            let rooms = layer.iter().skip(first).step_by(2);
+            rooms.map(metric.of).collect()
+        };
+        let best = |first: usize| {
+            let mean = |layer: &&Vec<LayerScores>| mean_of_known(&values(layer, first));
+            by_layer.iter().max_by(|a, b| mean(a).total_cmp(&mean(b)))
+        };
+        let (Some(chosen), Some(oracle)) = (best(0), best(1)) else {
+            continue;
+        };
+        let [chosen_scores, oracle_scores] = [chosen, oracle].map(|layer| values(layer, 1));
+        let cells = [
+            chosen[0].features.clone(),
+            format!("{:.3}", mean_of_known(&chosen_scores)),
+            oracle[0].features.clone(),
+            format!("{:.3}", mean_of_known(&oracle_scores)),
+            room_difference_text(&paired_difference(&oracle_scores, &chosen_scores, 0)),
+        ];
+        table.row(metric.name, cells);
+    }
+    table
+}
