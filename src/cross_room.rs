@@ -13,6 +13,7 @@ use super::rooms::{data, load_rooms, room_words};
 use super::store_option::StoreAndJson;
 use crate::errors_file::ErrorsFile;
 use crate::table_files::TableFiles;
+use seese3_core::adapter::CellLayout;
 use seese3_core::eval::{Protocol, check_thresholds};
 use seese3_core::features::Features;
 use seese3_core::navigation::{NavigatorKind, RetrievalMetric, StepKind};
@@ -123,6 +124,10 @@ impl CrossRoom {
         // All rooms are loaded with one feature set, that of the first training room: an adapter
         // only fits the features it was trained on.
         let test = load_rooms(&store, &self.test, Some(&source)).await?;
+        // Found now, not after the training of the adapter.
+        if self.reader.relational(self.seed).is_some() {
+            CellLayout::of(train[0].1.source())?;
+        }
         let shared = |(room, _): &&Loaded| {
             test.iter()
                 .any(|(other, _)| other.room.id() == room.room.id())

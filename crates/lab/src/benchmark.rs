@@ -5,9 +5,10 @@
 //! in the order of the benchmark.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
 
-use serde::de::IgnoredAny;
-use serde::{Deserialize, Serialize};
+use serde::de::{Error as _, IgnoredAny, MapAccess, Visitor};
+use serde::{Deserialize, Deserializer, Serialize};
 use sha2::{Digest, Sha256};
 
 use seese3_core::eval::{RetrievalScores, check_thresholds, default_thresholds};
@@ -104,9 +105,38 @@ pub struct Submission {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub url: Option<String>,
     /// The retrieved frames, one per pair, by room.
+    #[serde(deserialize_with = "without_duplicates")]
     pub frames: BTreeMap<String, Vec<u32>>,
     #[serde(default, skip_serializing)]
     made_by: IgnoredAny,
+}
+
+/// Reads a map, and refuses a key that occurs twice: JSON parsers keep the last one in silence.
+fn without_duplicates<'de, D: Deserializer<'de>>(
+    from: D,
+) -> Result<BTreeMap<String, Vec<u32>>, D::Error> {
+    struct Rooms;
+
+    impl<'de> Visitor<'de> for Rooms {
+        type Value = BTreeMap<String, Vec<u32>>;
+
+        fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+            f.write_str("the frames of each room")
+        }
+
+        fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Self::Value, A::Error> {
+            let mut rooms = BTreeMap::new();
+            while let Some((room, frames)) = map.next_entry::<String, Vec<u32>>()? {
+                if rooms.contains_key(&room) {
+                    return Err(A::Error::custom(format!("room '{room}' occurs twice")));
+                }
+                rooms.insert(room, frames);
+            }
+            Ok(rooms)
+        }
+    }
+
+    from.deserialize_map(Rooms)
 }
 
 /// SHA-256 of poses, as hexadecimal digits: of the 16 numbers of each `world_from_camera`, row by
@@ -558,6 +588,11 @@ mod tests {
             wrong.contains(&format!("frames.{name}[3]: is 1000000")),
             "{wrong}"
         );
+
+        let twice = serde_json::to_string(&right).unwrap();
+        let twice = twice.replacen("\"frames\":{", &format!("\"frames\":{{\"{name}\":[],"), 1);
+        let twice = Submission::read(twice.as_bytes(), &benchmark).unwrap_err();
+        assert!(twice.to_string().contains("occurs twice"), "{twice}");
 
         let file = serde_json::to_string(&benchmark.clone().file()).unwrap();
         assert_eq!(Benchmark::read(file.as_bytes()).unwrap(), benchmark);

@@ -159,7 +159,9 @@ pub fn baselines_text(found: &MotionBaselines) -> String {
             nearest.rotation_rad.to_degrees()
         )
     });
-    let verdict = if found.baselines.can_tell() {
+    let verdict = if constant_r2.is_nan() {
+        "\nthese pairs are too few for an R², which divides by the variance of their motions"
+    } else if found.baselines.can_tell() {
         ""
     } else {
         "\nthe constant is so far below 0 that these pairs cannot rate the adapter"
