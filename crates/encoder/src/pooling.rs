@@ -5,9 +5,10 @@
 //! rows, columns).
 
 use std::fmt;
+use std::ops::Range;
 use std::str::FromStr;
 
-use ndarray::{Array3, ArrayView3, ArrayViewD, Axis, Ix1, Ix2, Ix3};
+use ndarray::{Array3, ArrayView2, ArrayView3, ArrayViewD, Axis, Ix1, Ix2, Ix3};
 
 use super::Error;
 
@@ -143,35 +144,17 @@ impl Pooling {
                 },
                 2,
             ) if skip < shape[0] => {
-                // Tokens are ordered by time, row and column. A grid has no
-                // time axis, so the tokens of a clip are averaged over time.
-                let (times, height, width) = seen.patches(shape[0] - skip).ok_or_else(wrong)?;
+                let shape = seen.patches(shape[0] - skip).ok_or_else(wrong)?;
                 let tokens = output.into_dimensionality::<Ix2>().map_err(|_| wrong())?;
                 let patches = tokens.slice_move(ndarray::s![skip.., ..]);
-
-                let mean = |c: usize, place: usize| {
-                    let sum: f64 = (0..times)
-                        .map(|t| f64::from(patches[(t * height * width + place, c)]))
-                        .sum();
-                    (sum / times as f64) as f32
-                };
-                let map = Array3::from_shape_fn((shape[1], height, width), |(c, y, x)| {
-                    mean(c, y * width + x)
-                });
-
+                let map = map_of_tokens(patches, shape);
                 Ok(grid(map.view(), columns, rows))
             }
             (Self::Anchor { skip }, 2) if skip < shape[0] => {
-                // A token that covers the whole clip is not of one image.
-                let patches = seen.patches(shape[0] - skip);
-                let (times, height, width) =
-                    patches.filter(|(times, ..)| *times > 1).ok_or_else(wrong)?;
+                let of_anchor = seen.anchor(shape[0] - skip).ok_or_else(wrong)?;
                 let tokens = output.into_dimensionality::<Ix2>().map_err(|_| wrong())?;
-
-                let time = seen.window / 2 * times / seen.window;
-                let first = skip + time * height * width;
-                let of_anchor = ndarray::s![first..first + height * width, ..];
-                let patches = tokens.slice_move(of_anchor).reversed_axes();
+                let rows = skip + of_anchor.start..skip + of_anchor.end;
+                let patches = tokens.slice_move(ndarray::s![rows, ..]).reversed_axes();
                 Ok(grid(patches.insert_axis(Axis(1)), 1, 1))
             }
             (Self::Mean { .. }, 3) if shape[1] * shape[2] > 0 => Ok(grid(
@@ -212,6 +195,15 @@ impl InputSize {
             .find(|prefix| self.patches(tokens - prefix).is_some())
     }
 
+    /// Of a number of patch tokens, those of the anchor image; `None` if no token is of one image or
+    /// two.
+    fn anchor(self, tokens: usize) -> Option<Range<usize>> {
+        // A token that covers the whole clip is not of one image.
+        let (times, height, width) = self.patches(tokens).filter(|(times, ..)| *times > 1)?;
+        let first = self.window / 2 * times / self.window * height * width;
+        Some(first..first + height * width)
+    }
+
     /// The shape (times, rows, columns) of a number of patch tokens, if the image can be cut into
     /// that many square patches. A token of a clip may cover two images, one image, or the whole
     /// clip.
@@ -234,6 +226,24 @@ impl InputSize {
             fits.then_some((times, rows, columns))
         })
     }
+}
+
+/// The map (C, rows, columns) of patch tokens (N, C), which are ordered by time, row and column.
+/// `shape` is (times, rows, columns). A map has no time axis: the tokens of a clip are averaged over
+/// time.
+fn map_of_tokens(
+    patches: ArrayView2<'_, f32>,
+    (times, height, width): (usize, usize, usize),
+) -> Array3<f32> {
+    let mean = |c: usize, place: usize| {
+        let sum: f64 = (0..times)
+            .map(|t| f64::from(patches[(t * height * width + place, c)]))
+            .sum();
+        (sum / times as f64) as f32
+    };
+    Array3::from_shape_fn((patches.ncols(), height, width), |(c, y, x)| {
+        mean(c, y * width + x)
+    })
 }
 
 /// Means over the cells of a map (C, H, W). Cell i of n covers ⌊iH/n⌋ up to but not including
