@@ -6,31 +6,44 @@ use statrs::distribution::ContinuousCDF;
 
 use super::{deviation, mean, student, t_quantile_975};
 
-/// Number of random sign patterns of [`sign_flip_p`].
+/// Largest number of values of which [`sign_flip_p`] takes all sign patterns.
+const MOST_ENUMERATED: usize = 16;
+/// Number of random sign patterns for more values.
 const FLIPS: usize = 100_000;
 
-/// Two-sided p-value of "the values are symmetric around zero", by random flips of their signs.
+/// Two-sided p-value of "the values are symmetric around zero", by flipping their signs.
 ///
 /// It is the share of sign patterns whose mean is at least as far from zero as the mean of
-/// `values`, with the given pattern counted. For values of ±1 this is the binomial sign test. 1
-/// without values. The smallest possible p-value of n rooms is about 2^(1−n).
+/// `values`: of all patterns up to 16 values, else of 100,000 random ones and the given one. For
+/// values of ±1 this is the binomial sign test. 1 without values. The smallest possible p-value is
+/// 2^(1−n) of up to 16 values, and 1e-5 of more. The values have to be finite.
 ///
 /// Source: Fisher's randomization test of paired differences.
 pub fn sign_flip_p(values: &[f64], seed: u64) -> f64 {
     let observed = values.iter().sum::<f64>().abs();
     // Sums in another order differ by rounding errors.
     let tolerance = 1e-12 * values.iter().map(|value| value.abs()).sum::<f64>();
+    let is_as_far = |sum: f64| sum.abs() >= observed - tolerance;
+    let signed = |is_kept: bool, value: f64| if is_kept { value } else { -value };
+
+    if values.len() <= MOST_ENUMERATED {
+        let patterns = 1_u32 << values.len();
+        let sum = |pattern: u32| -> f64 {
+            let places = values.iter().enumerate();
+            places
+                .map(|(place, &value)| signed(pattern >> place & 1 == 1, value))
+                .sum()
+        };
+        let as_far = (0..patterns).filter(|&pattern| is_as_far(sum(pattern)));
+        return as_far.count() as f64 / f64::from(patterns);
+    }
 
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let as_far = (0..FLIPS).filter(|_| {
-        let flipped = values.iter().map(|value| {
-            if random.random_bool(0.5) {
-                *value
-            } else {
-                -value
-            }
-        });
-        flipped.sum::<f64>().abs() >= observed - tolerance
+        let flipped = values
+            .iter()
+            .map(|&value| signed(random.random_bool(0.5), value));
+        is_as_far(flipped.sum())
     });
     (as_far.count() + 1) as f64 / (FLIPS + 1) as f64
 }
@@ -67,7 +80,8 @@ pub struct CrossedMean {
 }
 
 /// The mean of values by training and room: `by_training[k][r]` is the value of room r with
-/// training k. `None` with fewer than two trainings or rooms: their spread is unknown.
+/// training k. `None` with fewer than two trainings or rooms, or if all values are equal and not
+/// zero: their spread is unknown.
 ///
 /// Its variance is the variance of the room means over the number of rooms, plus the variance of
 /// the training means over the number of trainings. That counts the residual twice, so the
@@ -96,11 +110,12 @@ pub fn crossed_mean(by_training: &[Vec<f64>]) -> Option<CrossedMean> {
         [&room_means, &training_means].map(|means| deviation(means).powi(2) / means.len() as f64);
     let variance = of_rooms + of_trainings;
     if variance == 0.0 {
-        return Some(CrossedMean {
+        // Equal values show no spread: they are no evidence for a mean that is not zero.
+        return (center == 0.0).then_some(CrossedMean {
             mean: center,
             low: center,
             high: center,
-            p: if center == 0.0 { 1.0 } else { 0.0 },
+            p: 1.0,
         });
     }
 
@@ -121,17 +136,19 @@ pub fn crossed_mean(by_training: &[Vec<f64>]) -> Option<CrossedMean> {
 mod tests {
     use super::*;
 
-    /// Oracle: SciPy's exact `permutation_test(permutation_type="samples")` of the mean, and its
-    /// `binomtest(8, 10)`.
+    /// Oracle: SciPy's exact `permutation_test(permutation_type="samples")` of the mean, its
+    /// `binomtest(8, 10)`, and its `binomtest(15, 20)` for random patterns.
     #[test]
     fn flipped_signs_have_the_exact_p_values() {
         let differences = [0.3, 0.1, -0.05, 0.2, 0.4, -0.1, 0.15, 0.25];
-        let p = sign_flip_p(&differences, 0);
-        assert!((p - 0.054_687_5).abs() < 0.003, "{p}");
+        assert_eq!(sign_flip_p(&differences, 0), 0.054_687_5);
 
         let won = [1.0, 1.0, 1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, 1.0];
-        let p = sign_flip_p(&won, 0);
-        assert!((p - 0.109_375).abs() < 0.004, "{p}");
+        assert_eq!(sign_flip_p(&won, 0), 0.109_375);
+
+        let many: Vec<f64> = (0..20).map(|i| if i < 15 { 1.0 } else { -1.0 }).collect();
+        let p = sign_flip_p(&many, 0);
+        assert!((p - 0.041_389).abs() < 0.002, "{p}");
 
         assert_eq!(sign_flip_p(&[], 0), 1.0);
         assert_eq!(sign_flip_p(&[0.0; 12], 0), 1.0);
@@ -167,5 +184,6 @@ mod tests {
         assert_eq!(crossed_mean(&[]), None);
         let equal = crossed_mean(&vec![vec![0.0; 5]; 3]).unwrap();
         assert_eq!((equal.mean, equal.p), (0.0, 1.0));
+        assert_eq!(crossed_mean(&vec![vec![1.0; 5]; 3]), None);
     }
 }

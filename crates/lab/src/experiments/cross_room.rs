@@ -35,6 +35,15 @@ pub fn clipped_r2(r2: f64) -> f64 {
     r2.clamp(CLIPPED_R2, f64::INFINITY)
 }
 
+/// A score by which the best of several is chosen; a score that is NaN is never the best.
+pub fn or_worst(score: f64) -> f64 {
+    if score.is_nan() {
+        f64::NEG_INFINITY
+    } else {
+        score
+    }
+}
+
 /// The scores of an adapter in one room.
 #[derive(Debug, Clone, Serialize)]
 pub struct RoomOutcome {

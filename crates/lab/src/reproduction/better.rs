@@ -5,11 +5,11 @@ use serde::Serialize;
 use seese3_core::statistics::{RoomMean, bootstrap_mean, mean_of_known, paired_difference};
 
 use super::Found;
-use super::claims::{Case, Claim};
+use super::claims::{Case, Claim, without_control};
 use super::cross::{AFFINE, HOMOGENEOUS};
 use super::notes::published_name;
 use super::plans::{MEMBERS, PlanKind, PlanResult, SetResults};
-use crate::experiments::cross_room::{CrossRoomRun, MotionSummary, clipped_r2};
+use crate::experiments::cross_room::{CrossRoomRun, MotionSummary, clipped_r2, or_worst};
 use crate::report::Column::{self, Text};
 use crate::report::{Section, Table, count_text, room_difference_text, room_mean_text};
 
@@ -87,7 +87,7 @@ pub fn section(results: &[SetResults], claims: &mut Vec<Claim>) -> Found<Vec<Bet
         "The best of these rows by Hit@0.1 in every second held-out room, scored in the rooms between, which did not choose it:",
     );
     section.table(chosen_table(results));
-    claims.extend(claims_of(results));
+    claims.extend(claims_of(without_control(results)));
 
     Found { section, record }
 }
@@ -110,7 +110,7 @@ fn chosen(set: &SetResults) -> Option<Chosen<'_>> {
     let choosing = |result: &PlanResult| {
         let hits = result.run.hit_rates(navigator_of(&result.run));
         let even: Vec<f64> = hits.into_iter().step_by(2).collect();
-        mean_of_known(&even)
+        or_worst(mean_of_known(&even))
     };
     let best = set
         .on_all_rooms

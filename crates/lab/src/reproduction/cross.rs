@@ -6,7 +6,7 @@ use serde::Serialize;
 use seese3_core::navigation::NavigatorKind;
 use seese3_core::statistics::{bootstrap_mean, mean_of_known, paired_difference};
 
-use super::claims::{Case, Claim};
+use super::claims::{Case, Claim, without_control};
 use super::notes::published_name;
 use super::plans::{AdapterPlan, PlanKind, SetResults, SizeResults};
 use super::{Error, Found, Reproduction, paper};
@@ -75,7 +75,7 @@ pub fn section(
         given.options.trainings
     ));
     add_curves(&mut section, results)?;
-    claims.extend(claims_of(results));
+    claims.extend(claims_of(without_control(results)));
 
     let record = results.iter().map(record).collect();
     Ok(Found { section, record })
@@ -118,7 +118,10 @@ const MEASURES: [Measure; 3] = [
     },
     Measure {
         name: "share of rooms with R² > 0",
-        of: |outcome| f64::from(u8::from(outcome.motion.overall > 0.0)),
+        of: |outcome| match outcome.motion.overall {
+            r2 if r2.is_nan() => r2,
+            r2 => f64::from(u8::from(r2 > 0.0)),
+        },
     },
     Measure {
         name: "mean max(R², 0)",

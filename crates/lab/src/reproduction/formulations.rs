@@ -50,7 +50,7 @@ pub fn section(
 
         // The paper trains for 200 epochs; the order changes with the length of the training.
         if training == Training::Paper {
-            let epochs = given.options.formulation_epochs;
+            let epochs = training.epochs(given).unwrap_or(PAPER_EPOCHS);
             let cases_of_set = over_alternatives(&set.features, &compared).into_iter();
             cases.extend(cases_of_set.map(|case| {
                 if epochs < PAPER_EPOCHS {
@@ -98,11 +98,8 @@ fn over_alternatives(features: &str, compared: &Comparison) -> Vec<Case> {
     let by_room = |scores: &FormulationScores| -> Vec<f64> {
         let by_seed = &scores.r2_by_seed_and_room;
         let room = |room: usize| {
-            let of_seeds: Vec<f64> = by_seed
-                .iter()
-                .map(|rooms| clipped_r2(rooms[room]))
-                .collect();
-            mean_of_known(&of_seeds)
+            let of_seeds: Vec<f64> = by_seed.iter().map(|rooms| rooms[room]).collect();
+            clipped_r2(mean_of_known(&of_seeds))
         };
         (0..by_seed.first().map_or(0, Vec::len)).map(room).collect()
     };

@@ -7,6 +7,7 @@ use sha2::{Digest, Sha256};
 
 use super::{Claim, Found, ReproducedAdapter, Reproduction};
 use crate::experiments::Error;
+use crate::experiments::adapter_sweep::content;
 use crate::report::Section;
 use seese3_core::adapter::{Adapter, TrainingRecord};
 use seese3_core::training::RoomData;
@@ -65,12 +66,13 @@ struct Step {
 
 impl Reproduction<'_> {
     /// The inputs of a part: the program's version, the given options, and the rooms with their
-    /// revisions and features.
+    /// revisions, their features, and a hash of poses and features.
     pub(super) fn inputs(&self, options: Value, rooms: &[&[RoomData<'_>]]) -> Value {
         let names = |rooms: &&[RoomData<'_>]| -> Vec<String> {
             let room = |data: &RoomData<'_>| {
                 let source = data.features.source();
-                format!("{} {} {source:?}", data.room.id(), data.revision)
+                let content = content(data);
+                format!("{} {} {content} {source:?}", data.room.id(), data.revision)
             };
             rooms.iter().map(room).collect()
         };
@@ -94,8 +96,9 @@ impl Reproduction<'_> {
             |problem: serde_json::Error| Error::Journal(format!("part '{name}': {problem}"));
         if let Some(kept) = self.journal.part(name).map_err(Error::Journal)?
             && kept.get("inputs") == Some(&inputs)
+            // A part in the format of another build of the program is made again.
+            && let Ok(kept) = serde_json::from_value::<Kept<T>>(kept)
         {
-            let kept: Kept<T> = serde_json::from_value(kept).map_err(failed)?;
             return Ok(kept.result);
         }
 

@@ -169,6 +169,13 @@ pub fn check(given: &Reproduction<'_>) -> Result<(), Error> {
                 data.room.id()
             )));
         }
+        // It would count twice where both groups are tested together.
+        if let Some(data) = set.in_room.iter().find(is_held_out) {
+            return Err(Error::Input(format!(
+                "room '{}' is in both --in-room and --test",
+                data.room.id()
+            )));
+        }
     }
 
     // Every set has the same rooms, so checking the first one is enough.

@@ -14,7 +14,7 @@ use seese3_core::splits::Split;
 use seese3_core::statistics::mean_of_known;
 use seese3_core::training::{RoomData, train_adapter};
 
-use super::claims::{Case, Claim};
+use super::claims::{Case, Claim, without_control};
 use super::notes::{Notes, ReproducedAdapter};
 use super::{Error, Found, Reproduction, paper};
 use crate::report::{Figure, Section, Series, Table, fixed};
@@ -73,7 +73,9 @@ pub fn section(
             format!("Hit@ε within a room, features {}", set.features),
         );
 
-        over_correctors.extend(navigated.over_correctors());
+        if position < without_control(&given.sets).len() {
+            over_correctors.extend(navigated.over_correctors());
+        }
         record.extend(rows);
     }
 

@@ -12,7 +12,7 @@ use seese3_core::splits::Split;
 use seese3_core::statistics::{mean, mean_of_known, median};
 use seese3_core::training::RoomData;
 
-use super::claims::{Case, Claim};
+use super::claims::{Case, Claim, without_control};
 use super::cross::HOMOGENEOUS;
 use super::notes::Notes;
 use super::plans::steady_adapter;
@@ -107,6 +107,11 @@ pub fn section(
          takes each step from the frame that the last one retrieved.",
         given.options.strides
     ));
+    let encoders: Vec<&str> = without_control(&given.sets)
+        .iter()
+        .map(|set| set.features.as_str())
+        .collect();
+    walks.retain(|walks| encoders.contains(&walks.features.as_str()));
     claims.extend(claims_of(&walks));
     Ok(Found { section, record })
 }
