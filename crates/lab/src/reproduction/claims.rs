@@ -21,7 +21,7 @@ pub struct Claim {
     pub claim: String,
     /// The quantity of each room whose mean is tested: above zero where the claim holds.
     pub tested: String,
-    /// Whether these rooms confirm it; [`Verdict::Untested`] until [`judge`] decides.
+    /// Whether these rooms confirm it; [`Verdict::Untested`] until all claims are judged together.
     #[serde(serialize_with = "word", deserialize_with = "of_word")]
     pub verdict: Verdict,
     /// The cases in which it was tested.
