@@ -1,30 +1,34 @@
-//! `seese3 benchmark`: freezes rooms and pairs, answers them, and scores what others retrieve.
+//! `seese3 benchmark`: freezes rooms and pairs, answers them, scores what others retrieve, and
+//! measures features in the frozen rooms.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, ensure};
 use clap::{Args, Subcommand};
 
 use super::evaluate::navigators_named;
 use super::named::one_of;
-use super::output::{JsonOutput, check_writable, say, write_json, write_result};
+use super::output::{JsonOutput, begin_output, say, write_file, write_json};
 use super::progress::bar;
-use super::rooms::room_names;
+use super::rooms::{data, room_names};
 use crate::table_files::TableFiles;
 use seese3_core::cancel::Cancellation;
 use seese3_core::eval::{Protocol, evaluate};
+use seese3_core::features::FeatureSource;
 use seese3_core::geometry::Pose;
 use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::splits::{Pair, Split};
-use seese3_lab::benchmark::{Benchmark, Submission, score};
-use seese3_lab::report::{benchmark_page, benchmark_table};
+use seese3_lab::benchmark::{
+    Benchmark, Error, FeatureMetrics, MetricMeans, RoomMetrics, Submission, score,
+};
+use seese3_lab::report::{benchmark_page, benchmark_table, metrics_page, metrics_table};
 use seese3_store::Store;
 
 /// Largest benchmark or submission that is read, bytes.
 const MOST_BYTES: u64 = 256 << 20;
 
-/// Freeze rooms and pairs as a benchmark, and score submissions of retrieved frames
+/// Freeze rooms and pairs as a benchmark, score submissions, and compare encoders in its rooms
 #[derive(Debug, Args)]
 pub struct BenchmarkCommand {
     #[command(subcommand)]
@@ -41,6 +45,10 @@ enum What {
     Check(Check),
     /// Score submissions: Hit@ε over rooms beside standing still, with intervals
     Score(Score),
+    /// Measure M1 to M4 of features in the rooms of a benchmark, by one fixed protocol
+    Probe(ProbeFeatures),
+    /// Compare the features of several files of `benchmark probe`
+    Encoders(Encoders),
 }
 
 #[derive(Debug, Args)]
@@ -120,6 +128,45 @@ struct Score {
     json: JsonOutput,
 }
 
+#[derive(Debug, Args)]
+struct ProbeFeatures {
+    /// The benchmark file
+    #[arg(long, value_name = "FILE")]
+    benchmark: PathBuf,
+    /// The store with its rooms and their features
+    #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
+    store: String,
+    /// Name of the feature set, the same for every room
+    #[arg(long)]
+    features: String,
+    /// Name of the features in the table; that of the feature set if omitted
+    #[arg(long)]
+    name: Option<String>,
+    /// One sentence: the encoder, its weights, the layer and the pooling
+    #[arg(long)]
+    about: String,
+    /// The file of metrics to write
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+}
+
+#[derive(Debug, Args)]
+struct Encoders {
+    /// The benchmark file
+    #[arg(long, value_name = "FILE")]
+    benchmark: PathBuf,
+    /// A file of `benchmark probe`; may be given several times
+    #[arg(long = "metrics", value_name = "FILE", required = true)]
+    metrics: Vec<PathBuf>,
+    /// Also write a page of the metrics to this Markdown file
+    #[arg(long, value_name = "FILE.md")]
+    page: Option<PathBuf>,
+    #[command(flatten)]
+    files: TableFiles,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
 impl BenchmarkCommand {
     pub async fn run(self) -> anyhow::Result<()> {
         match self.what {
@@ -127,13 +174,15 @@ impl BenchmarkCommand {
             What::Answer(answer) => answer.run().await,
             What::Check(check) => check.run(),
             What::Score(score) => score.run().await,
+            What::Probe(probe) => probe.run().await,
+            What::Encoders(encoders) => encoders.run(),
         }
     }
 }
 
 impl Freeze {
     async fn run(self) -> anyhow::Result<()> {
-        check_writable(&self.out)?;
+        begin_output(&self.out)?;
         let store = Store::open(&self.store)?;
         let mut rooms = Vec::new();
         for name in room_names(&store, &self.rooms).await? {
@@ -159,7 +208,7 @@ impl Freeze {
 
 impl Answer {
     async fn run(self) -> anyhow::Result<()> {
-        check_writable(&self.out)?;
+        begin_output(&self.out)?;
         let benchmark = read_benchmark(&self.benchmark)?;
         let store = Store::open(&self.store)?;
         let adapter = store.load_adapter(&self.adapter, None).await?.adapter;
@@ -225,22 +274,19 @@ impl Score {
     async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
         self.files.begin()?;
-        if let Some(page) = &self.page {
-            check_writable(page)?;
-        }
+        self.page.as_deref().map_or(Ok(()), begin_output)?;
 
         let benchmark = read_benchmark(&self.benchmark)?;
         let mut submissions = Vec::new();
         for file in &self.submissions {
             let submission = read_submission(file, &benchmark)?;
             let is_same = |other: &Submission| other.name == submission.name;
-            if submissions.iter().any(is_same) {
-                bail!(
-                    "{}: the name '{}' is in two submissions",
-                    file.display(),
-                    submission.name
-                );
-            }
+            ensure!(
+                !submissions.iter().any(is_same),
+                "{}: the name '{}' is in two submissions",
+                file.display(),
+                submission.name
+            );
             submissions.push(submission);
         }
 
@@ -272,8 +318,7 @@ impl Score {
 
         self.files.say(&benchmark_table(&scores), &benchmark.name)?;
         if let Some(page) = &self.page {
-            write_result(page, benchmark_page(&benchmark, &scores).as_bytes())?;
-            say(format_args!("wrote {}", page.display()));
+            write_page(page, &benchmark_page(&benchmark, &scores))?;
         }
         self.json.write(&serde_json::json!({
             "benchmark": { "name": benchmark.name, "sha256": benchmark.sha256() },
@@ -282,16 +327,97 @@ impl Score {
     }
 }
 
-fn read_benchmark(file: &std::path::Path) -> anyhow::Result<Benchmark> {
-    let place = file.display();
-    let bytes = seese3_files::read(file, MOST_BYTES);
-    let bytes = bytes.with_context(|| format!("{place} cannot be read"))?;
-    Benchmark::read(&bytes).with_context(|| format!("{place}"))
+impl ProbeFeatures {
+    async fn run(self) -> anyhow::Result<()> {
+        begin_output(&self.out)?;
+        let benchmark = read_benchmark(&self.benchmark)?;
+        let store = Store::open(&self.store)?;
+        let name = self.name.as_ref().unwrap_or(&self.features);
+
+        // One room after the other; within a room, the seeds of M4 are trained in parallel.
+        let progress = bar(benchmark.rooms.len() as u64, "probing");
+        let mut source: Option<FeatureSource> = None;
+        let mut rooms = Vec::with_capacity(benchmark.rooms.len());
+        for frozen in &benchmark.rooms {
+            let loaded = store
+                .load_room_with(&frozen.room, Some(&self.features))
+                .await?;
+            frozen.check_poses(loaded.0.room.poses())?;
+            let made = loaded.1.source();
+            let first = source.get_or_insert_with(|| made.clone());
+            ensure!(
+                first == made,
+                "room '{}': its features '{}' were made in another way than those of room '{}'",
+                frozen.room,
+                self.features,
+                benchmark.rooms[0].room
+            );
+
+            let measured = RoomMetrics::measure(&data(&loaded), benchmark.stride);
+            rooms.push(measured.with_context(|| format!("room '{}'", frozen.room))?);
+            progress.inc(1);
+        }
+        progress.finish_and_clear();
+
+        let source = source.context("the benchmark has no rooms")?;
+        let metrics = FeatureMetrics::new(&benchmark, [name, &self.about], source, rooms);
+        metrics.check(&benchmark)?;
+        write_json(&self.out, &metrics)?;
+        say(metrics_table(&[MetricMeans::of(&metrics)]));
+        say(format_args!("wrote {}", self.out.display()));
+        Ok(())
+    }
 }
 
-fn read_submission(file: &std::path::Path, benchmark: &Benchmark) -> anyhow::Result<Submission> {
+impl Encoders {
+    fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+        self.files.begin()?;
+        self.page.as_deref().map_or(Ok(()), begin_output)?;
+
+        let benchmark = read_benchmark(&self.benchmark)?;
+        let mut means: Vec<MetricMeans> = Vec::new();
+        for file in &self.metrics {
+            let metrics = read(file, |bytes| FeatureMetrics::read(bytes, &benchmark))?;
+            ensure!(
+                means.iter().all(|other| other.name != metrics.name),
+                "{}: the name '{}' is in two files",
+                file.display(),
+                metrics.name
+            );
+            means.push(MetricMeans::of(&metrics));
+        }
+        means.sort_by(|a, b| b.m4.mean.total_cmp(&a.m4.mean));
+
+        self.files.say(&metrics_table(&means), &benchmark.name)?;
+        if let Some(page) = &self.page {
+            write_page(page, &metrics_page(&benchmark, &means))?;
+        }
+        self.json.write(&serde_json::json!({
+            "benchmark": { "name": benchmark.name, "sha256": benchmark.sha256() },
+            "features": means,
+        }))
+    }
+}
+
+fn write_page(file: &Path, page: &str) -> anyhow::Result<()> {
+    write_file(file, page.as_bytes())?;
+    say(format_args!("wrote {}", file.display()));
+    Ok(())
+}
+
+fn read_benchmark(file: &Path) -> anyhow::Result<Benchmark> {
+    read(file, Benchmark::read)
+}
+
+fn read_submission(file: &Path, benchmark: &Benchmark) -> anyhow::Result<Submission> {
+    read(file, |bytes| Submission::read(bytes, benchmark))
+}
+
+/// Reads a file, and then its content. Errors name the file.
+fn read<T>(file: &Path, content: impl FnOnce(&[u8]) -> Result<T, Error>) -> anyhow::Result<T> {
     let place = file.display();
     let bytes = seese3_files::read(file, MOST_BYTES);
     let bytes = bytes.with_context(|| format!("{place} cannot be read"))?;
-    Submission::read(&bytes, benchmark).with_context(|| format!("{place}"))
+    content(&bytes).with_context(|| format!("{place}"))
 }

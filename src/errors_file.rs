@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::output::{LAST_OPTION, check_writable, say, write_file};
+use super::output::{LAST_OPTION, begin_output, say, write_file};
 
 #[derive(Debug, Args)]
 pub struct ErrorsFile {
@@ -22,7 +22,7 @@ impl ErrorsFile {
 
     /// Checks, before the work, that the file can be written.
     pub fn begin(&self) -> anyhow::Result<()> {
-        self.errors.as_deref().map_or(Ok(()), check_writable)
+        self.errors.as_deref().map_or(Ok(()), begin_output)
     }
 
     /// Writes the file, if it was asked for.

@@ -7,7 +7,7 @@ use clap::{Args, Subcommand};
 use ndarray::{Array1, Array2};
 use serde_json::json;
 
-use super::output::{check_folder, check_writable, say, write_file};
+use super::output::{begin_output, check_folder, say, write_file};
 use super::store_option::StoreAndJson;
 use seese3_data::datasets::{BundleContents, KeypointArrays, write_numpy};
 use seese3_data::export::{kitti_trajectory, tum_trajectory};
@@ -121,7 +121,7 @@ impl From {
     }
 
     fn write(&self, text: &str) -> anyhow::Result<()> {
-        check_writable(&self.out)?;
+        begin_output(&self.out)?;
         write_file(&self.out, text.as_bytes())?;
         say(format_args!("wrote {}", self.out.display()));
         self.common.json.write(&json!({ "files": [&self.out] }))

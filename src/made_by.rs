@@ -1,11 +1,12 @@
 //! `made_by` of JSON results: what made them, so that a file can be made again.
 
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 use std::sync::OnceLock;
 use std::time::Instant;
 
 use chrono::{DateTime, SecondsFormat, Utc};
 use clap::ArgMatches;
+use clap::parser::ValueSource;
 use serde::Serialize;
 
 /// How the program was called. A static, because the command line belongs to the process.
@@ -60,7 +61,7 @@ struct Runtime {
 /// Records the command line, for the results of this process.
 pub fn remember_call(arguments: &[OsString], matches: &ArgMatches) {
     let call = Call {
-        command: quoted(arguments),
+        command: quoted(store_variable(matches).as_deref(), arguments),
         seed: seed(matches),
         time: Utc::now(),
         begun: Instant::now(),
@@ -103,30 +104,57 @@ impl MadeBy {
 
 /// The value of `--seed` in effect, of the innermost command.
 fn seed(matches: &ArgMatches) -> Option<u64> {
+    // An unknown name is an error, and means that the command has no such option.
+    let mut values = innermost(matches).try_get_raw("seed").ok()??;
+    values.next()?.to_str()?.parse().ok()
+}
+
+/// The store, if it is that of the variable SEESE3_STORE. No other variable is recorded: those of
+/// the client are secrets.
+fn store_variable(matches: &ArgMatches) -> Option<OsString> {
+    let matches = innermost(matches);
+    let mut values = matches.try_get_raw("store").ok()??;
+    let is_variable = matches.value_source("store") == Some(ValueSource::EnvVariable);
+    values
+        .next()
+        .filter(|_| is_variable)
+        .map(OsStr::to_os_string)
+}
+
+fn innermost(matches: &ArgMatches) -> &ArgMatches {
     let mut innermost = matches;
     while let Some((_, inner)) = innermost.subcommand() {
         innermost = inner;
     }
-    // An unknown name is an error, and means that the command has no such option.
-    let mut values = innermost.try_get_raw("seed").ok()??;
-    values.next()?.to_str()?.parse().ok()
+    innermost
 }
 
-/// The arguments as a line for a POSIX shell.
-fn quoted(arguments: &[OsString]) -> String {
+/// The arguments as a line for a POSIX shell, after the variable of the store if it was used.
+fn quoted(store: Option<&OsStr>, arguments: &[OsString]) -> String {
+    let variable = store.map(|store| format!("SEESE3_STORE={}", quoted_word(store)));
+    // The name of the program, whatever its folder.
+    let words = variable.into_iter().chain(["seese3".to_owned()]);
+    let options = arguments.iter().skip(1).map(|word| quoted_word(word));
+    words.chain(options).collect::<Vec<_>>().join(" ")
+}
+
+/// A word for a POSIX shell. Bytes that are not UTF-8 are written as `$'\xFF'`.
+fn quoted_word(word: &OsStr) -> String {
     let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./:=,@%+".contains(c);
-    let words = arguments.iter().enumerate().map(|(position, argument)| {
-        let word = argument.to_string_lossy();
-        // The name of the program, whatever its folder.
-        if position == 0 {
-            "seese3".to_owned()
-        } else if !word.is_empty() && word.chars().all(is_plain) {
-            word.into_owned()
-        } else {
-            format!("'{}'", word.replace('\'', r"'\''"))
-        }
-    });
-    words.collect::<Vec<_>>().join(" ")
+    let Some(text) = word.to_str() else {
+        let bytes = word.as_encoded_bytes().iter();
+        let escaped = bytes.map(|&byte| match char::from(byte) {
+            c if byte.is_ascii() && is_plain(c) => c.to_string(),
+            _ => format!("\\x{byte:02x}"),
+        });
+        return format!("$'{}'", escaped.collect::<String>());
+    };
+
+    if !text.is_empty() && text.chars().all(is_plain) {
+        text.to_owned()
+    } else {
+        format!("'{}'", text.replace('\'', r"'\''"))
+    }
 }
 
 /// The processor's model, as Linux states it.
@@ -145,9 +173,23 @@ mod tests {
     fn command_lines_are_quoted_for_a_shell() {
         let arguments = ["/bin/x", "train", "--room", "studio*", "it's", ""].map(OsString::from);
         assert_eq!(
-            quoted(&arguments),
+            quoted(None, &arguments),
             r"seese3 train --room 'studio*' 'it'\''s' ''"
         );
+        let store = Some(OsStr::new("my store"));
+        assert_eq!(
+            quoted(store, &arguments[..2]),
+            "SEESE3_STORE='my store' seese3 train"
+        );
+    }
+
+    /// Oracle: bash: `printf %s $'caf\xe9\x20b' | xxd -p` prints 636166e92062.
+    #[cfg(unix)]
+    #[test]
+    fn words_that_are_not_utf8_keep_their_bytes() {
+        use std::os::unix::ffi::OsStrExt;
+        let word = OsStr::from_bytes(b"caf\xe9 b");
+        assert_eq!(quoted_word(word), r"$'caf\xe9\x20b'");
     }
 
     /// Oracle: clap: the default counts, and commands without a seed have none.

@@ -184,7 +184,7 @@ enum Command {
     /// Describe recordings by statistics, to compare drawn rooms with real ones
     Card(card::Card),
     #[cfg(feature = "lab")]
-    /// Freeze rooms and pairs as a benchmark, and score submissions of retrieved frames
+    /// Freeze rooms and pairs as a benchmark, score submissions, and compare encoders in its rooms
     Benchmark(benchmark::BenchmarkCommand),
     #[cfg(feature = "lab")]
     /// Compare many layers, adapter configurations or formulations in one run

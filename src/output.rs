@@ -3,8 +3,8 @@
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, OnceLock, PoisonError};
 
 use anyhow::Context;
 use clap::Args;
@@ -18,6 +18,9 @@ static IS_SILENT: AtomicBool = AtomicBool::new(false);
 
 /// The first error of a write to standard output.
 static PRINT_PROBLEM: OnceLock<String> = OnceLock::new();
+
+/// The outputs of this process.
+static OUTPUTS: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
 
 /// Place of `--json` in the help of a command: after the command's own options.
 pub const LAST_OPTION: usize = 900;
@@ -43,14 +46,7 @@ impl JsonOutput {
 
     /// Checks, before the work, that the file can be written.
     pub fn begin(&self) -> anyhow::Result<()> {
-        match &self.json {
-            Some(path) if is_standard_output(path) => {
-                silence();
-                Ok(())
-            }
-            Some(path) => check_writable(path),
-            None => Ok(()),
-        }
+        self.json.as_deref().map_or(Ok(()), begin_output)
     }
 
     /// Whether `--json` was given.
@@ -198,12 +194,40 @@ pub fn not_built(what: &str, feature: &str) -> anyhow::Error {
     )
 }
 
-/// Rejects an output file in a missing folder. Called before a long computation starts.
-pub fn check_writable(path: &Path) -> anyhow::Result<()> {
-    if path.is_dir() {
+/// Called for each output before a long computation starts. Rejects a file in a missing folder, and
+/// a second output to the same file. "-" turns text output off.
+pub fn begin_output(path: &Path) -> anyhow::Result<()> {
+    if is_standard_output(path) {
+        silence();
+    } else if path.is_dir() {
         anyhow::bail!("{} is a folder; name a file in it", path.display());
     }
-    check_folder(path)
+    check_folder(path)?;
+
+    let mut outputs = OUTPUTS.lock().unwrap_or_else(PoisonError::into_inner);
+    let place = absolute(path);
+    // Devices, for example /dev/null, take any number of outputs.
+    let is_device = std::fs::metadata(&place).is_ok_and(|found| !found.is_file());
+    if !is_device && outputs.contains(&place) {
+        anyhow::bail!("{}: two outputs cannot have the same file", path.display());
+    }
+    outputs.push(place);
+    Ok(())
+}
+
+/// The path with its folder made absolute, and without symbolic links.
+fn absolute(path: &Path) -> PathBuf {
+    if let Ok(found) = std::fs::canonicalize(path) {
+        return found;
+    }
+    let folder = match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    };
+    match (std::fs::canonicalize(folder), path.file_name()) {
+        (Ok(folder), Some(name)) => folder.join(name),
+        _ => path.to_owned(),
+    }
 }
 
 /// Rejects an output whose parent folder does not exist.
@@ -235,7 +259,7 @@ pub fn write_json(path: &Path, record: &impl Serialize) -> anyhow::Result<()> {
     let made_by = Some(MadeBy::now());
     let mut text = serde_json::to_string_pretty(&Signed { record, made_by })?;
     text.push('\n');
-    write_result(path, text.as_bytes())
+    write_file(path, text.as_bytes())
 }
 
 /// Writes a record that a later run of the same command reads, as indented JSON without `made_by`.
@@ -244,18 +268,14 @@ pub fn write_intermediate(path: &Path, record: &impl Serialize) -> anyhow::Resul
     write_file(path, &serde_json::to_vec_pretty(record)?)
 }
 
-/// Writes results to a file, or to standard output.
-pub fn write_result(path: &Path, content: &[u8]) -> anyhow::Result<()> {
+/// Writes a file atomically: readers see either the old file or the complete new one. A device or a
+/// pipe is written to directly, and "-" is standard output.
+pub fn write_file(path: &Path, content: &[u8]) -> anyhow::Result<()> {
     if is_standard_output(path) {
         print(content);
         return Ok(());
     }
-    write_file(path, content)
-}
 
-/// Writes a file atomically: readers see either the old file or the complete new one. A device or a
-/// pipe is written to directly.
-pub fn write_file(path: &Path, content: &[u8]) -> anyhow::Result<()> {
     let failed = || format!("{} cannot be written", path.display());
 
     // A symbolic link is kept; its target is replaced.

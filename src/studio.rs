@@ -14,7 +14,7 @@ use super::encode::{by_layer, check_names, has, has_keypoints, same_poses};
 use super::encoder::{EncoderOptions, RuntimeOptions, feature_prefix, say_features};
 use super::keypoints::{map_keypoints, mapping_inputs, room_keypoints};
 use super::named::one_of;
-use super::output::{JsonOutput, check_writable, say, write_file};
+use super::output::{JsonOutput, begin_output, say, write_file};
 use super::progress::bar;
 use seese3_core::cancel::Cancellation;
 use seese3_core::features::FeatureSource;
@@ -373,7 +373,7 @@ impl Studio {
     }
 
     fn sheet(&self, file: &Path) -> anyhow::Result<()> {
-        check_writable(file)?;
+        begin_output(file)?;
         let count = self.rooms.min(SHEET_ROOMS);
 
         // Images are rendered at twice the tile's size; `tiled` averages 2×2 pixels against

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::output::{check_writable, say, write_file};
+use super::output::{begin_output, say, write_file};
 use seese3_lab::report::{Table, dot_plot};
 #[cfg(feature = "plots")]
 use seese3_lab::report::{plot_pdf, plot_png};
@@ -25,7 +25,7 @@ impl TableFiles {
     /// Checks, before the work, that the files can be written.
     pub fn begin(&self) -> anyhow::Result<()> {
         let files = self.table.iter().chain(&self.plot);
-        files.map(PathBuf::as_path).try_for_each(check_writable)
+        files.map(PathBuf::as_path).try_for_each(begin_output)
     }
 
     /// Prints the table, and writes the files that were asked for. `title` is that of the plot.

@@ -23,7 +23,7 @@ use anyhow::{Context, bail};
 use clap::{Args, Subcommand};
 
 use super::named::one_of;
-use super::output::{JsonOutput, STANDARD_OUTPUT, check_writable, say, write_file};
+use super::output::{JsonOutput, STANDARD_OUTPUT, begin_output, say, write_file};
 use super::progress::bar;
 use crate::errors_file::{ErrorsFile, parquet};
 use crate::table_files::{plot_file, table_file, write_plot};
@@ -177,7 +177,7 @@ impl Navigation {
         let errors = ErrorsFile::to(self.errors.clone());
         errors.begin()?;
         for file in self.plot.iter().chain(&self.table) {
-            check_writable(file)?;
+            begin_output(file)?;
         }
 
         let store = Store::open(&self.store)?;

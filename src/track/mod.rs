@@ -11,7 +11,7 @@ use tokio_stream::wrappers::ReceiverStream;
 
 use crate::ask::{Server, ViewCamera, wire_json};
 use crate::camera::CAMERA_FORM;
-use crate::output::{JsonOutput, check_writable, say, write_file};
+use crate::output::{JsonOutput, begin_output, say, write_file};
 use crate::progress::bar;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::track_request::Message;
@@ -108,7 +108,7 @@ impl Track {
             .into_iter()
             .flatten()
         {
-            check_writable(path)?;
+            begin_output(path)?;
         }
 
         if !(self.rate.is_finite() && self.rate > 0.0) {

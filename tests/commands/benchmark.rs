@@ -71,3 +71,77 @@ fn submissions_are_scored_as_evaluate_scores() {
         &["'paper' is in two submissions"],
     );
 }
+
+/// Oracle: two ways to one number: `probe` with the same protocol. A changed file is refused by its
+/// field.
+#[test]
+fn features_are_measured_as_probe_measures() {
+    let here = Place::new();
+    here.succeeds(&Place::import("r", "synthetic"));
+    here.succeeds(
+        "benchmark freeze --store store --room r --stride 20 --name small --out small.json",
+    );
+    let measure = "benchmark probe --benchmark small.json --store store --features fourier";
+    here.succeeds(&format!(
+        "{measure} --name mine --about Waves. --out mine.json"
+    ));
+    here.succeeds(
+        "probe --store store --room r --features fourier --stride 20 --split folds --preset base \
+         --m1-stride 2 --m2-gap 0 --json probe.json",
+    );
+
+    let [ours, theirs] = ["mine.json", "probe.json"].map(|file| here.json(file));
+    let ours = &ours["rooms"]["r"];
+    for (key, expected) in [
+        ("m1", &theirs["m1"]["value"]),
+        ("m2_twonn", &theirs["m2"]["twonn"]),
+        ("m2_mle", &theirs["m2"]["mle"]),
+        ("m3", &theirs["m3"]["r2"]),
+        ("m4", &theirs["m4"]["r2"]),
+        ("constant", &theirs["m3"]["baselines"]["constant_r2"]),
+    ] {
+        assert_eq!(&ours[key], expected, "{key}");
+    }
+
+    let compare = "benchmark encoders --benchmark small.json --metrics mine.json";
+    here.prints(
+        &format!("{compare} --page page.md --json means.json"),
+        &["mine", "M4 R² over the constant"],
+    );
+    let means = here.json("means.json");
+    assert_eq!(means["features"][0]["m1"]["mean"], ours["m1"]);
+    let page = std::fs::read_to_string(here.file("page.md")).unwrap();
+    assert!(page.contains("**mine**: Waves."), "{page}");
+
+    let text = std::fs::read_to_string(here.file("mine.json")).unwrap();
+    let wrong = text.replacen("\"m1\": 0", "\"m1\": 7", 1);
+    std::fs::write(here.file("wrong.json"), wrong).unwrap();
+    let compare_wrong = "benchmark encoders --benchmark small.json --metrics wrong.json";
+    here.refuses(
+        compare_wrong,
+        &["wrong.json", "rooms.r.m1: must be from 0 to 1"],
+    );
+    here.refuses(
+        &format!("{compare} --metrics mine.json"),
+        &["'mine' is in two files"],
+    );
+}
+
+/// Oracle: every output is whole JSON, or the command is refused.
+#[test]
+fn outputs_do_not_mix() {
+    let here = Place::new();
+    here.succeeds(&Place::import("r", "synthetic"));
+    let freeze = "benchmark freeze --store store --room r --stride 20 --name small --out";
+    let written = here.succeeds(&format!("{freeze} -"));
+    assert!(
+        serde_json::from_str::<serde_json::Value>(&written).is_ok(),
+        "{written}"
+    );
+
+    here.refuses(
+        "card --store store --room r --features fourier --table both.md --json ./both.md",
+        &["both.md: two outputs cannot have the same file"],
+    );
+    assert!(!here.file("both.md").exists());
+}

@@ -31,7 +31,7 @@ mod training;
 pub use adapter_sweep::{
     configurations_table, difficulty_table, parts_table, success_table, sweep_parquet,
 };
-pub use benchmark::{benchmark_page, benchmark_table};
+pub use benchmark::{benchmark_page, benchmark_table, metrics_page, metrics_table};
 pub use columns::{ParquetColumn, parquet_file};
 pub use cross_room::{
     CrossRoomJson, count_text, cross_room_json, cross_room_table, room_difference_text,

@@ -1,6 +1,6 @@
 //! Statistics of recordings as a table.
 
-use super::table::Column::{self, Number, Text};
+use super::table::Column::{self, Text};
 use super::table::Table;
 use crate::experiments::room_card::{MedianError, RoomCard};
 use seese3_core::statistics::{mean_of_known, median};
@@ -11,23 +11,24 @@ pub fn room_card_table(cards: &[RoomCard]) -> Table {
         Text("room", |card| card.room.clone()),
         Text("frames", |card| card.frames.to_string()),
         Text("visits", |card| card.visits.to_string()),
-        Number("m in 20 frames", 3, |card| card.step_m),
-        Number("° in 20 frames", 1, |card| card.step_deg),
+        Text("m in 20 frames", |card| known(card.step_m, 3)),
+        Text("° in 20 frames", |card| known(card.step_deg, 1)),
         Text("persistence of v after 1, 10, 20", |card| {
             three(card.persistence_v)
         }),
         Text("of ω", |card| three(card.persistence_w)),
-        Number("revisited", 2, |card| card.revisited),
+        Text("revisited", |card| known(card.revisited, 2)),
         Text("overlap of visits", |card| {
-            card.overlap
-                .map_or(String::new(), |share| format!("{share:.2}"))
+            card.overlap.map_or(String::new(), |share| known(share, 2))
         }),
         Text("across visits by feature", |card| {
             error_text(card.across_by_feature)
         }),
         Text("by pose", |card| error_text(card.across_by_pose)),
-        Number("participation ratio", 1, |card| card.participation_ratio),
-        Number("feature step", 2, |card| card.feature_step),
+        Text("participation ratio", |card| {
+            known(card.participation_ratio, 1)
+        }),
+        Text("feature step", |card| known(card.feature_step, 2)),
         Text("recorded as", |card| card.format.clone()),
     ];
 
@@ -44,7 +45,7 @@ pub fn medians(cards: &[RoomCard]) -> RoomCard {
     };
     let three =
         |values: fn(&RoomCard) -> [f64; 3]| [0, 1, 2].map(|at| of(&|card| values(card)[at]));
-    let known = |of: fn(&RoomCard) -> Option<f64>| {
+    let of_several = |of: fn(&RoomCard) -> Option<f64>| {
         let values: Vec<f64> = cards.iter().filter_map(of).collect();
         (!values.is_empty()).then(|| median(&values))
     };
@@ -72,7 +73,7 @@ pub fn medians(cards: &[RoomCard]) -> RoomCard {
         persistence_v: three(|card| card.persistence_v),
         persistence_w: three(|card| card.persistence_w),
         revisited: of(&|card| card.revisited),
-        overlap: known(|card| card.overlap),
+        overlap: of_several(|card| card.overlap),
         across_by_feature: error(|card| card.across_by_feature),
         across_by_pose: error(|card| card.across_by_pose),
         participation_ratio: of(&|card| card.participation_ratio),
@@ -80,12 +81,32 @@ pub fn medians(cards: &[RoomCard]) -> RoomCard {
     }
 }
 
-fn three([one, ten, twenty]: [f64; 3]) -> String {
-    format!("{one:.2}, {ten:.2}, {twenty:.2}")
+fn three(values: [f64; 3]) -> String {
+    values.map(|value| known(value, 2)).join(", ")
+}
+
+/// The number, or a dash where the recording is too short for it.
+fn known(value: f64, decimals: usize) -> String {
+    match value.is_nan() {
+        true => "–".to_owned(),
+        false => format!("{value:.decimals$}"),
+    }
 }
 
 fn error_text(error: Option<MedianError>) -> String {
     error.map_or(String::new(), |error| {
         format!("{:.2} m {:.1}°", error.translation_m, error.rotation_deg)
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: by hand.
+    #[test]
+    fn what_a_short_recording_lacks_is_a_dash() {
+        assert_eq!(three([0.5, f64::NAN, f64::NAN]), "0.50, –, –");
+        assert_eq!(known(12.345, 1), "12.3");
+    }
 }

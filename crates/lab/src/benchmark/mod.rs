@@ -2,10 +2,15 @@
 //!
 //! A [`Benchmark`] names the pairs and the candidate frames of each room, and the SHA-256 of the
 //! room's poses. Its own SHA-256 identifies it. A [`Submission`] has one retrieved frame per pair,
-//! in the order of the benchmark.
+//! in the order of the benchmark. [`FeatureMetrics`] are M1 to M4 of one feature set in its rooms.
+
+mod metrics;
+
+pub use metrics::{FeatureMetrics, MetricMeans, RoomMetrics};
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
+use std::marker::PhantomData;
 
 use serde::de::{Error as _, IgnoredAny, MapAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
@@ -112,31 +117,31 @@ pub struct Submission {
 }
 
 /// Reads a map, and refuses a key that occurs twice: JSON parsers keep the last one in silence.
-fn without_duplicates<'de, D: Deserializer<'de>>(
+fn without_duplicates<'de, D: Deserializer<'de>, T: Deserialize<'de>>(
     from: D,
-) -> Result<BTreeMap<String, Vec<u32>>, D::Error> {
-    struct Rooms;
+) -> Result<BTreeMap<String, T>, D::Error> {
+    struct Rooms<T>(PhantomData<T>);
 
-    impl<'de> Visitor<'de> for Rooms {
-        type Value = BTreeMap<String, Vec<u32>>;
+    impl<'de, T: Deserialize<'de>> Visitor<'de> for Rooms<T> {
+        type Value = BTreeMap<String, T>;
 
         fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-            f.write_str("the frames of each room")
+            f.write_str("an object with an entry for each room")
         }
 
         fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Self::Value, A::Error> {
             let mut rooms = BTreeMap::new();
-            while let Some((room, frames)) = map.next_entry::<String, Vec<u32>>()? {
+            while let Some((room, of_room)) = map.next_entry::<String, T>()? {
                 if rooms.contains_key(&room) {
                     return Err(A::Error::custom(format!("room '{room}' occurs twice")));
                 }
-                rooms.insert(room, frames);
+                rooms.insert(room, of_room);
             }
             Ok(rooms)
         }
     }
 
-    from.deserialize_map(Rooms)
+    from.deserialize_map(Rooms(PhantomData))
 }
 
 /// SHA-256 of poses, as hexadecimal digits: of the 16 numbers of each `world_from_camera`, row by
@@ -218,10 +223,7 @@ impl Benchmark {
             sha256, benchmark, ..
         } = file;
 
-        if benchmark.format != BENCHMARK_FORMAT {
-            let problem = format!("is '{}', not '{BENCHMARK_FORMAT}'", benchmark.format);
-            return Err(Error::new("format", problem));
-        }
+        check_format(&benchmark.format, BENCHMARK_FORMAT)?;
         if sha256 != benchmark.sha256() {
             let problem = "does not match the content: the file was changed; take the original";
             return Err(Error::new("sha256", problem));
@@ -361,35 +363,14 @@ impl Submission {
     /// # Errors
     /// [`Error`] names the first field that is wrong.
     pub fn check(&self, benchmark: &Benchmark) -> Result<(), Error> {
-        if self.format != SUBMISSION_FORMAT {
-            let problem = format!("is '{}', not '{SUBMISSION_FORMAT}'", self.format);
-            return Err(Error::new("format", problem));
-        }
-        if self.benchmark != benchmark.sha256() {
-            let problem = format!(
-                "is not the benchmark '{}' ({})",
-                benchmark.name,
-                benchmark.sha256()
-            );
-            return Err(Error::new("benchmark", problem));
-        }
-        check_text("name", &self.name)?;
-        check_text("about", &self.about)?;
+        check_format(&self.format, SUBMISSION_FORMAT)?;
+        check_benchmark(&self.benchmark, benchmark)?;
+        check_description(&self.name, &self.about, self.url.as_deref())?;
         if self.name == IDENTITY {
             return Err(Error::new(
                 "name",
                 "is that of the baseline; choose another",
             ));
-        }
-        if let Some(url) = &self.url {
-            let is_address = url.starts_with("https://") || url.starts_with("http://");
-            let is_plain = |c: char| c.is_ascii_graphic() && !"<>()[]\"`".contains(c);
-            if !is_address || !url.chars().all(is_plain) {
-                return Err(Error::new(
-                    "url",
-                    "must be an address that begins with https://",
-                ));
-            }
         }
 
         let known = |name: &String| benchmark.rooms.iter().any(|room| room.room == *name);
@@ -489,6 +470,40 @@ pub fn score(benchmark: &Benchmark, submission: &Submission, rooms: &[&[Pose]]) 
         median_m: over_rooms(|scores| scores.translation_m_median),
         median_deg: over_rooms(|scores| scores.rotation_rad_median.to_degrees()),
     }
+}
+
+fn check_format(format: &str, expected: &str) -> Result<(), Error> {
+    if format != expected {
+        let problem = format!("is '{format}', not '{expected}'");
+        return Err(Error::new("format", problem));
+    }
+    Ok(())
+}
+
+/// Refuses a file that was made for another benchmark.
+fn check_benchmark(sha256: &str, benchmark: &Benchmark) -> Result<(), Error> {
+    let expected = benchmark.sha256();
+    if sha256 != expected {
+        let problem = format!("is not the benchmark '{}' ({expected})", benchmark.name);
+        return Err(Error::new("benchmark", problem));
+    }
+    Ok(())
+}
+
+/// Checks what a file says about its method.
+fn check_description(name: &str, about: &str, url: Option<&str>) -> Result<(), Error> {
+    check_text("name", name)?;
+    check_text("about", about)?;
+
+    if let Some(url) = url {
+        let is_address = url.starts_with("https://") || url.starts_with("http://");
+        let is_plain = |c: char| c.is_ascii_graphic() && !"<>()[]\"`".contains(c);
+        if !is_address || !url.chars().all(is_plain) {
+            let problem = "must be an address that begins with https://";
+            return Err(Error::new("url", problem));
+        }
+    }
+    Ok(())
 }
 
 /// Refuses an empty text, and characters that would break the line of a table or a page.
