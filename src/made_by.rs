@@ -12,6 +12,9 @@ use serde::Serialize;
 /// How the program was called. A static, because the command line belongs to the process.
 static CALL: OnceLock<Call> = OnceLock::new();
 
+/// The git commit of the program, with "-modified" for a changed tree; `None` if unknown.
+pub const COMMIT: Option<&str> = option_env!("SEESE3_COMMIT");
+
 /// The runtime of the encoder that was opened first.
 static ENCODER_RUNTIME: OnceLock<&'static str> = OnceLock::new();
 
@@ -28,7 +31,7 @@ struct Call {
 pub struct MadeBy {
     /// The version of the program.
     version: &'static str,
-    /// The git commit of the program, with "-modified" for a changed tree; `None` if unknown.
+    /// As [`COMMIT`].
     commit: Option<&'static str>,
     /// The command line, quoted for a POSIX shell.
     command: String,
@@ -84,7 +87,7 @@ impl MadeBy {
 
         Self {
             version: env!("CARGO_PKG_VERSION"),
-            commit: option_env!("SEESE3_COMMIT"),
+            commit: COMMIT,
             command: call.map_or_else(String::new, |call| call.command.clone()),
             seed: call.and_then(|call| call.seed),
             time: time.to_rfc3339_opts(SecondsFormat::Secs, true),

@@ -1,13 +1,15 @@
 //! `seese3 reproduce`: the paper's tables and figures on given rooms, as one report.
 
+use std::collections::BTreeSet;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use anyhow::{Context, bail};
 use clap::Args;
 use serde::Serialize;
-use serde_json::Value;
+use serde_json::{Value, json};
 use tokio::runtime::Handle;
 
 use seese3_core::adapter::{Adapter, TrainingRecord};
@@ -20,6 +22,7 @@ use seese3_lab::reproduction::{
     Reproduction, ReproductionRecord, adapter_names, check, reproduce,
 };
 
+use super::made_by;
 use super::output::{JsonOutput, say, write_file, write_intermediate, write_json};
 use super::progress::bar;
 use super::rooms::{data, load_rooms};
@@ -169,9 +172,18 @@ impl Reproduce {
 
         // A run that fails before this point publishes nothing.
         let published = publish(&store, &adapters).await?;
+        let other_commits = journal.other_commits();
+        if !other_commits.is_empty() {
+            say(format_args!(
+                "some parts were made by the program of other commits ({}); to make all of them again, remove {}",
+                other_commits.join(", "),
+                self.out.join(STEPS).display()
+            ));
+        }
         let record = FileRecord {
             record,
             adapters: published,
+            other_commits,
             seconds: begun.elapsed().as_secs_f64(),
         };
 
@@ -228,7 +240,12 @@ struct FolderJournal {
     folder: PathBuf,
     store: Store,
     runtime: Handle,
+    /// The commits of the program that made the parts which were read.
+    commits: Mutex<BTreeSet<String>>,
 }
+
+/// The key of a part's commit in its file.
+const COMMIT: &str = "commit";
 
 impl FolderJournal {
     /// Opens the journal in a folder, or begins one.
@@ -248,7 +265,16 @@ impl FolderJournal {
             folder: folder.to_owned(),
             store: Store::open(location)?,
             runtime: Handle::current(),
+            commits: Mutex::default(),
         })
+    }
+
+    /// The commits of the program that made the parts which were read, other than this program's.
+    fn other_commits(&self) -> Vec<String> {
+        let commits = self.commits.lock().unwrap_or_else(PoisonError::into_inner);
+        let others = commits.iter();
+        let others = others.filter(|&commit| Some(commit.as_str()) != made_by::COMMIT);
+        others.cloned().collect()
     }
 
     fn file(&self, part: &str) -> PathBuf {
@@ -264,12 +290,21 @@ impl Journal for FolderJournal {
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
             Err(error) => return Err(format!("{}: {error}", file.display())),
         };
-        let part = serde_json::from_slice(&bytes);
-        part.map_err(|error| format!("{}: {error}; remove it", file.display()))
+        let part = serde_json::from_slice::<Value>(&bytes);
+        let part = part.map_err(|error| format!("{}: {error}; remove it", file.display()))?;
+        if let Some(commit) = part.get(COMMIT).and_then(Value::as_str) {
+            let mut commits = self.commits.lock().unwrap_or_else(PoisonError::into_inner);
+            commits.insert(commit.to_owned());
+        }
+        Ok(Some(part))
     }
 
     fn keep_part(&self, name: &str, part: &Value) -> Result<(), String> {
-        write_intermediate(&self.file(name), part).map_err(|error| format!("{error:#}"))
+        let mut part = part.clone();
+        if let Some(part) = part.as_object_mut() {
+            part.insert(COMMIT.to_owned(), json!(made_by::COMMIT));
+        }
+        write_intermediate(&self.file(name), &part).map_err(|error| format!("{error:#}"))
     }
 
     fn adapter(&self, name: &str) -> Result<Option<(Adapter, TrainingRecord)>, String> {
@@ -301,6 +336,8 @@ struct FileRecord {
     #[serde(flatten)]
     record: ReproductionRecord,
     adapters: Vec<PublishedAdapter>,
+    /// The commits of the program that made the parts of earlier runs.
+    other_commits: Vec<String>,
     /// Wall time of the whole run.
     seconds: f64,
 }

@@ -35,7 +35,7 @@ use seese3_core::eval::{
 use seese3_core::features::Features;
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::navigation::NavigatorKind;
-use seese3_core::navigation::{IndexKind, Mode, Navigator};
+use seese3_core::navigation::{IndexKind, Mode, Navigator, SHORTLIST};
 use seese3_core::room::RoomId;
 use seese3_core::splits::Split;
 use seese3_core::training::{motions, predictions};
@@ -76,6 +76,10 @@ enum What {
     Robustness(robustness::Robustness),
     /// APE and RPE of an estimated trajectory against the true one, as evo defines them
     Trajectory(trajectory::EvaluateTrajectory),
+}
+
+fn at_least_one() -> clap::builder::RangedU64ValueParser<usize> {
+    clap::builder::RangedU64ValueParser::new().range(1..)
 }
 
 /// Prints which rooms the adapter was trained or calibrated on.
@@ -145,6 +149,10 @@ struct Navigation {
     /// How the steps are chained
     #[arg(long, value_parser = one_of::<Mode>(), default_value = "open-loop")]
     mode: Mode,
+    /// Number of frames that the relational reader compares with the source: those nearest by
+    /// inverse Poincaré
+    #[arg(long, default_value_t = SHORTLIST, value_parser = at_least_one())]
+    shortlist: usize,
     /// Seed of the random navigator
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -331,6 +339,7 @@ impl Navigation {
             seed: self.seed,
             steps: self.steps,
             mode: self.mode,
+            shortlist: self.shortlist,
             navigators: navigators_named(&self.navigators)?,
         })
     }

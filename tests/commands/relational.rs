@@ -31,6 +31,13 @@ fn a_relational_reader_is_trained_evaluated_and_served() {
     let rate = number(&row["hit"]["0.1"]["rate"]);
     assert!((0.0..=1.0).contains(&rate), "{row}");
 
+    // A shortlist of one is what inverse Poincaré retrieves.
+    here.succeeds(&format!("{evaluate} --shortlist 1 --json one.json"));
+    let found = here.json("one.json");
+    let rows = found["navigators"].as_array().unwrap();
+    let hits = |name: &str| rows.iter().find(|row| row["name"] == name).unwrap()["hit"].clone();
+    assert_eq!(hits("relational"), hits("inverse-poincare-homogeneous"));
+
     let motion =
         "evaluate motion --store store --room studio3-0002 --adapter eyes --json motion.json";
     here.prints(motion, &["its relational reader", "no motion"]);

@@ -21,6 +21,7 @@ use seese3_core::cancel::Cancellation;
 use seese3_core::eval::{
     Leak, PredictionScope, Protocol, TrainedOn, evaluate, is_calibrated_in, score_predictions,
 };
+use seese3_core::navigation::SHORTLIST;
 use seese3_core::splits::{Pair, Split};
 
 type Events = mpsc::Sender<Result<pb::EvaluateResponse, Status>>;
@@ -173,6 +174,7 @@ fn protocol(
         seed,
         steps: steps.unwrap_or(1),
         mode: convert::mode_of(step_mode)?,
+        shortlist: SHORTLIST,
         navigators,
     };
 

@@ -233,8 +233,8 @@ pub fn open_for(
         return Ok(None);
     }
 
-    // The encoder must give one layer of the adapter's input width.
-    if encoder.dims() != [source.dim] {
+    // The encoder must give the adapter's input width; joined features have several layers.
+    if encoder.dims().iter().sum::<usize>() != source.dim {
         return Err(seese3_encoder::Error::Option {
             what: "encoder",
             given: encoder.id().to_owned(),

@@ -11,8 +11,9 @@ use crate::cancel::Cancellation;
 use crate::geometry::{Pose, body_twist};
 use crate::index::Exclusion;
 use crate::navigation::{
-    self, Leg, Mode, Navigator, NavigatorKind, Plan, RefitData, RelationalView, RelationalWalk,
-    RetrievalMetric, Search, Space, Start, StepKind, Stepper, relational_walk, walk,
+    self, Leg, Mode, Navigator, NavigatorKind, Plan, RefitData, RelationalSpace, RelationalView,
+    RelationalWalk, RetrievalMetric, SHORTLIST, Search, Space, Start, StepKind, Stepper,
+    relational_walk, walk,
 };
 use crate::room::{FrameId, Timeline};
 use crate::splits::{Pair, Split};
@@ -36,6 +37,8 @@ pub struct Protocol {
     pub steps: u32,
     /// How these steps are chained.
     pub mode: Mode,
+    /// Number of frames that the relational reader compares with the source; at least 1.
+    pub shortlist: usize,
     /// Rows of the table; if empty, those of [`NavigatorKind::table`] that can be fitted in the
     /// room.
     pub navigators: Vec<NavigatorKind>,
@@ -95,6 +98,7 @@ impl Protocol {
             seed: 0,
             steps: 1,
             mode: Mode::OpenLoop,
+            shortlist: SHORTLIST,
             navigators: Vec::new(),
         }
     }
@@ -271,7 +275,10 @@ impl TableInputs<'_> {
             self.latents,
             &self.candidates,
         )?;
-        let space = self.navigator.relational_space(&search)?;
+        let space = RelationalSpace {
+            shortlist: self.protocol.shortlist,
+            ..self.navigator.relational_space(&search)?
+        };
 
         let mut retrieved = Vec::with_capacity(self.test.len());
         for &pair in &self.test {

@@ -7,8 +7,8 @@ use strum::VariantArray;
 
 use super::{
     Error, FitOn, IndexKind, Leg, Limits, Method, Mode, Plan, Query, Refit, RefitData,
-    RelationalSpace, RelationalView, RelationalWalk, RequestedMotion, RetrievalMetric, Search,
-    Source, Space, Start, StepKind, Stepper, check_twist, relational_walk, walk,
+    RelationalSpace, RelationalView, RelationalWalk, RequestedMotion, RetrievalMetric, SHORTLIST,
+    Search, Source, Space, Start, StepKind, Stepper, check_twist, relational_walk, walk,
 };
 use crate::adapter::{self, Adapter, Cells};
 use crate::cancel::Cancellation;
@@ -175,6 +175,7 @@ impl Navigator {
             reader,
             cells,
             search,
+            shortlist: SHORTLIST,
         })
     }
 

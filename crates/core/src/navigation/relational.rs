@@ -13,10 +13,10 @@ use crate::geometry::{Pose, Twist, body_twist, exp};
 use crate::index::{Exclusion, Neighbor};
 use crate::room::FrameId;
 
-/// Number of frames that the reader compares with the source view. Rooms of up to this many frames
-/// are searched completely.
+/// Default number of frames that the reader compares with the source view. Rooms of up to this many
+/// frames are searched completely.
 ///
-/// docs/relational.md has the hits by this number.
+/// `seese3 evaluate --shortlist` gives the hits by this number; docs/relational.md has them.
 pub const SHORTLIST: usize = 1_024;
 
 /// The views of a room for relational navigation.
@@ -30,6 +30,8 @@ pub struct RelationalSpace<'a> {
     pub cells: &'a Cells,
     /// Search over the candidate frames under [`super::RetrievalMetric::Full`].
     pub search: &'a Search,
+    /// Number of frames that the reader compares with the source view, at least 1.
+    pub shortlist: usize,
 }
 
 /// A view that a motion starts from.
@@ -60,7 +62,7 @@ impl RelationalSpace<'_> {
         let imagined = view.latent + &step;
         let shortlist = self
             .search
-            .nearest(imagined.view(), SHORTLIST.max(k), exclusion);
+            .nearest(imagined.view(), self.shortlist.max(k), exclusion);
 
         let rows: Vec<usize> = shortlist
             .iter()

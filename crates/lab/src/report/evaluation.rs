@@ -195,6 +195,7 @@ struct ProtocolJson<'a> {
     seed: u64,
     steps: u32,
     mode: &'static str,
+    shortlist: usize,
     index: &'static str,
     #[serde(flatten)]
     context: EvaluationContext,
@@ -221,6 +222,7 @@ pub fn evaluation_json<'a>(
             seed: protocol.seed,
             steps: protocol.steps,
             mode: protocol.mode.name(),
+            shortlist: protocol.shortlist,
             index: "exact",
             context,
         },

@@ -6,13 +6,15 @@ use std::path::PathBuf;
 use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 use ndarray::Array2;
 use seese3_client::proto::v1 as pb;
-use seese3_core::adapter::Preset;
+use seese3_core::adapter::{Preset, RelationalConfig};
 use seese3_core::features::Features;
 use seese3_core::image::RgbImage;
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_core::splits::Split;
-use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
-use seese3_encoder::{Bounds, Encoder, Runtime, RuntimeKind};
+use seese3_core::training::{RoomData, TrainingPlan, train_adapter, train_reader};
+use seese3_encoder::{
+    Bounds, Encoder, Layer, ModelTask, Preparation, Resize, Runtime, RuntimeKind,
+};
 use seese3_server::{Config, ImageEncoders};
 use seese3_store::Store;
 use seese3_studio::{Camera, Scene, camera_path, render};
@@ -196,6 +198,131 @@ async fn an_image_is_answered_as_its_frame_is() {
     let b = by_frame.twist.unwrap().linear.unwrap();
     for (a, b) in [(a.x, b.x), (a.y, b.y), (a.z, b.z)] {
         near("v", a, b, 1e-5);
+    }
+}
+
+/// An encoder of two layers of a tiny model, each pooled to a grid.
+fn two_grids() -> (String, Encoder) {
+    let file = seese3_testing::golden().join("encoder/image.onnx");
+    let layer = |name: &str| Layer {
+        name: name.to_owned(),
+        base: "name".to_owned(),
+        norm: "none".to_owned(),
+        pooling: "grid2x2".parse().unwrap(),
+    };
+    let task = ModelTask {
+        file: file.clone(),
+        preparation: Preparation {
+            resize: Resize::Whole {
+                width: 8,
+                height: 6,
+            },
+            divisor: 255.0,
+            ..Preparation::default()
+        },
+        layers: vec![layer("map"), layer("tokens")],
+        window: 1,
+        keypoints: None,
+        is_prefix_stated: true,
+    };
+    let runtime = Runtime {
+        kind: RuntimeKind::Tract,
+        threads: 1,
+        library: None,
+    };
+    let encoder = Encoder::model(task, &runtime).unwrap();
+    (file.to_str().unwrap().to_owned(), encoder)
+}
+
+/// Oracle: PNG is lossless, so a frame's image is the frame, also where a feature joins two layers
+/// of the encoder and a relational reader compares their cells.
+#[tokio::test]
+async fn images_of_joined_features_are_answered_as_their_frames_are() {
+    if !RuntimeKind::Tract.is_built() {
+        eprintln!("skipped: built without the feature onnx");
+        return;
+    }
+
+    let (model, encoder) = two_grids();
+    let (pictures, frames) = pictures();
+    let prepared: Vec<RgbImage> = pictures
+        .iter()
+        .map(|picture| encoder.prepare(picture.clone()).unwrap())
+        .collect();
+    let clips: Vec<Vec<&RgbImage>> = prepared.iter().map(|picture| vec![picture]).collect();
+    let rows: Array2<f32> = encoder.encode(&clips).unwrap();
+
+    let mut begin = 0;
+    let features = encoder.sources("tiny").into_iter().map(|source| {
+        let end = begin + source.dim;
+        let columns = rows.slice(ndarray::s![.., begin..end]).to_owned();
+        begin = end;
+        Features::new(source, columns).unwrap()
+    });
+    let features: Vec<Features> = features.collect();
+    let joined = Features::joined(&[&features[0], &features[1]]).unwrap();
+
+    let folder = tempfile::tempdir().unwrap();
+    let store = Store::create(folder.path().to_str().unwrap()).unwrap();
+    let room = Room::new(RoomId::new(ROOM).unwrap(), frames, Provenance::default()).unwrap();
+    store.publish_room(&room, &features).await.unwrap();
+    let data = RoomData {
+        room: &room,
+        revision: 1,
+        features: &joined,
+    };
+    let plan = TrainingPlan::of(Preset::PaperBase, Split::Time, 10, 0);
+    let (adapter, mut record) = train_adapter(&[data], &plan, &mut |_| ()).unwrap();
+    let config = RelationalConfig {
+        epochs: 1,
+        hidden: 16,
+        ..RelationalConfig::default()
+    };
+    let reader = train_reader(&[data], Split::Time, &config, &mut |_| ()).unwrap();
+    record.relational = Some(config);
+    let adapter = adapter.with_relational(reader).unwrap();
+    let published = store.publish_adapter("eyes", &adapter, &record, joined.rows());
+    published.await.unwrap();
+    let server = start_on(folder, store, with_encoders(&[&model])).await;
+
+    for navigator in ["inverse-poincare-affine", "relational"] {
+        let ask = |source| pb::NavigateRequest {
+            navigator: navigator.to_owned(),
+            top_k: Some(5),
+            ..navigate(source)
+        };
+        let found = [image(png(&pictures[50])), frame(50)].map(ask);
+        let [by_image, by_frame] = found.map(|request| server.client.navigate(request));
+        let [by_image, by_frame] = [by_image.await.unwrap(), by_frame.await.unwrap()];
+        let frames = |answer: &pb::NavigateResponse| -> Vec<u32> {
+            let frames = answer.steps[0].frames.iter();
+            frames.map(|frame| frame.frame_id).collect()
+        };
+        assert_eq!(frames(&by_image), frames(&by_frame), "{navigator}");
+    }
+
+    for estimator in [
+        pb::MotionEstimator::Unspecified,
+        pb::MotionEstimator::Relational,
+    ] {
+        let ask = |first, second| pb::EstimateMotionRequest {
+            room: ROOM.to_owned(),
+            first,
+            second,
+            estimator: estimator.into(),
+            ..pb::EstimateMotionRequest::default()
+        };
+        let by_image = ask(image(png(&pictures[20])), image(png(&pictures[30])));
+        let by_image = server.client.estimate_motion(by_image).await.unwrap();
+        let by_frame = ask(frame(20), frame(30));
+        let by_frame = server.client.estimate_motion(by_frame).await.unwrap();
+        let [a, b] = [by_image, by_frame].map(|answer| {
+            let linear = answer.motion.unwrap().twist.unwrap().linear.unwrap();
+            [linear.x, linear.y, linear.z]
+        });
+        for (a, b) in a.into_iter().zip(b) {
+            near("v", a, b, 1e-5);
+        }
     }
 }
 
