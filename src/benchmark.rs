@@ -9,7 +9,7 @@ use clap::{Args, Subcommand};
 
 use super::evaluate::navigators_named;
 use super::named::one_of;
-use super::output::{JsonOutput, begin_output, say, write_file, write_json};
+use super::output::{JsonOutput, begin_output, say, write_compact_json, write_file, write_json};
 use super::progress::bar;
 use super::rooms::{data, room_names};
 use crate::table_files::TableFiles;
@@ -249,7 +249,7 @@ impl Answer {
 
         let submission = benchmark.submission(&self.name, &self.about, frames);
         submission.check(&benchmark)?;
-        write_json(&self.out, &submission)?;
+        write_compact_json(&self.out, &submission)?;
         say(format_args!("wrote {}", self.out.display()));
         Ok(())
     }

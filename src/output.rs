@@ -262,6 +262,15 @@ pub fn write_json(path: &Path, record: &impl Serialize) -> anyhow::Result<()> {
     write_file(path, text.as_bytes())
 }
 
+/// As [`write_json`], on one line: for long lists of numbers.
+#[cfg(feature = "lab")]
+pub fn write_compact_json(path: &Path, record: &impl Serialize) -> anyhow::Result<()> {
+    let made_by = Some(MadeBy::now());
+    let mut text = serde_json::to_string(&Signed { record, made_by })?;
+    text.push('\n');
+    write_file(path, text.as_bytes())
+}
+
 /// Writes a record that a later run of the same command reads, as indented JSON without `made_by`.
 #[cfg(feature = "lab")]
 pub fn write_intermediate(path: &Path, record: &impl Serialize) -> anyhow::Result<()> {

@@ -6,7 +6,9 @@
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-use seese3_core::statistics::{RoomMean, bootstrap_mean, crossed_mean, holm, sign_flip_p};
+use seese3_core::statistics::{
+    CrossedMean, RoomMean, bootstrap_mean, crossed_mean, holm, sign_flip_p,
+};
 
 use crate::report::Column::{self, Text};
 use crate::report::{Section, Table, room_difference_text};
@@ -96,6 +98,14 @@ impl Case {
         Self::of_rooms(case, &differences)
     }
 
+    /// The differences `ours − theirs`, paired by training and room.
+    pub fn of_differences(case: impl Into<String>, ours: &[Vec<f64>], theirs: &[Vec<f64>]) -> Self {
+        match &differences(ours, theirs)[..] {
+            [alone] => Self::of_rooms(case, alone),
+            several => Self::of_trainings(case, several),
+        }
+    }
+
     /// A value per training and room, with the spread of both; see [`crossed_mean`]. Rooms with a
     /// value that is not finite are left out.
     pub fn of_trainings(case: impl Into<String>, by_training: &[Vec<f64>]) -> Self {
@@ -115,12 +125,7 @@ impl Case {
         };
         Self {
             case: case.into(),
-            mean: Some(RoomMean {
-                mean: crossed.mean,
-                low: crossed.low,
-                high: crossed.high,
-                rooms,
-            }),
+            mean: Some(room_mean(&crossed, rooms)),
             trainings: Some(by_training.len()),
             p: Some(crossed.p),
             adjusted_p: None,
@@ -154,6 +159,33 @@ impl Case {
     fn holds(&self) -> Option<bool> {
         let is_decided = self.adjusted_p? < SIGNIFICANCE;
         is_decided.then_some(self.mean?.mean > 0.0)
+    }
+}
+
+/// The differences `ours − theirs`, paired by training and room.
+pub fn differences(ours: &[Vec<f64>], theirs: &[Vec<f64>]) -> Vec<Vec<f64>> {
+    let of_training = |(ours, theirs): (&Vec<f64>, &Vec<f64>)| {
+        ours.iter().zip(theirs).map(|(a, b)| a - b).collect()
+    };
+    ours.iter().zip(theirs).map(of_training).collect()
+}
+
+/// The mean over trainings and rooms with the spread of both; of one training, or where the spread
+/// is unknown, over the rooms alone.
+pub fn mean_over_trainings(by_training: &[Vec<f64>]) -> RoomMean {
+    let alone = by_training.first().map_or(&[][..], Vec::as_slice);
+    match crossed_mean(by_training) {
+        Some(crossed) => room_mean(&crossed, alone.len()),
+        None => bootstrap_mean(alone, 0),
+    }
+}
+
+fn room_mean(crossed: &CrossedMean, rooms: usize) -> RoomMean {
+    RoomMean {
+        mean: crossed.mean,
+        low: crossed.low,
+        high: crossed.high,
+        rooms,
     }
 }
 
@@ -367,5 +399,29 @@ mod tests {
 
         assert_eq!(claims[0].verdict, Verdict::CannotTell);
         assert!(claims[0].cases.iter().all(|case| case.reason.is_some()));
+    }
+
+    /// Oracle: by hand, and for one training the bootstrap over rooms.
+    #[test]
+    fn differences_are_paired_by_training_and_room() {
+        let ours = [vec![0.5, 0.7], vec![0.4, 0.6]];
+        let theirs = [vec![0.25, 0.5], vec![0.4, 0.5]];
+        let found = differences(&ours, &theirs);
+        let expected = [[0.25, 0.2], [0.0, 0.1]];
+        for (found, expected) in found.iter().flatten().zip(expected.iter().flatten()) {
+            assert!((found - expected).abs() < 1e-12, "{found} {expected}");
+        }
+
+        let both = mean_over_trainings(&found);
+        assert!((both.mean - 0.1375).abs() < 1e-12);
+        assert_eq!(both.rooms, 2);
+        assert_eq!(
+            mean_over_trainings(&found[..1]),
+            bootstrap_mean(&found[0], 0)
+        );
+        let case = Case::of_differences("x", &ours, &theirs);
+        assert_eq!((case.trainings, case.mean), (Some(2), Some(both)));
+        let case = Case::of_differences("x", &ours[..1], &theirs[..1]);
+        assert_eq!(case.trainings, None);
     }
 }

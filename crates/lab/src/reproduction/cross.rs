@@ -50,7 +50,7 @@ pub fn section(
     // Report skipped rooms only for the run of the table: paper-range on all rooms.
     for set in results {
         let features = &set.features;
-        for skipped in &set.baseline().run.skipped {
+        for skipped in &set.first_baseline().skipped {
             let (room, why) = (&skipped.room, &skipped.why);
             section.text(format!("Skipped with {features}: room {room}: {why}."));
         }
@@ -140,7 +140,7 @@ fn claims_of(results: &[SetResults]) -> Vec<Claim> {
             "zero-shot navigation beats Identity in most rooms never seen (Hit@0.1)",
             "½ in a room with more hits than Identity, −½ in the others",
             per_set(&|set| {
-                let run = &set.baseline().run;
+                let run = set.first_baseline();
                 let pairs = run.hit_rates(AFFINE).into_iter();
                 let pairs = pairs.zip(run.hit_rates(&NavigatorKind::Identity.name()));
                 let won = pairs.map(|(ours, identity)| if ours > identity { 0.5 } else { -0.5 });
@@ -150,7 +150,7 @@ fn claims_of(results: &[SetResults]) -> Vec<Claim> {
         Claim::new(
             "refitting the linear step in the room, on the pairs that are scored, does better than zero-shot",
             "Hit@0.1 of the z-scored refit in sample minus zero-shot",
-            per_set(&|set| refit(&set.baseline().run, &set.features, REFIT)),
+            per_set(&|set| refit(set.first_baseline(), &set.features, REFIT)),
         ),
         Claim::new(
             "refitting it in a first visit does better than zero-shot in the next visit",
@@ -291,7 +291,7 @@ fn table(results: &[SetResults]) -> Table {
     );
 
     for set in results {
-        let run = &set.baseline().run;
+        let run = set.first_baseline();
         for name in [
             AFFINE,
             HOMOGENEOUS,

@@ -26,8 +26,8 @@ pub const MEMBERS: usize = 4;
 /// An upper bound on the length of plan names, for checking names before training.
 pub const LONGEST_NAME: &str = "paper-range-aside-of-100000";
 
-/// The kinds of adapters in the cross-room sections.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// The kinds of adapters in the cross-room sections, in the order of their table.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum PlanKind {
     /// The paper's preset.
     PaperRange,
@@ -108,11 +108,17 @@ impl AdapterPlan {
 }
 
 /// A plan and the results of its adapter in the held-out rooms.
-pub struct PlanResult {
-    /// The plan.
-    pub plan: AdapterPlan,
-    /// The results.
-    pub run: CrossRoomRun,
+struct PlanResult {
+    plan: AdapterPlan,
+    run: CrossRoomRun,
+}
+
+/// Several trainings of one kind of adapter on all rooms.
+pub struct KindResults {
+    /// The kind.
+    pub kind: PlanKind,
+    /// One run per seed, from 0.
+    pub runs: Vec<CrossRoomRun>,
 }
 
 /// Several trainings of the paper's preset on one number of rooms.
@@ -127,8 +133,8 @@ pub struct SizeResults {
 pub struct SetResults {
     /// The name of the features.
     pub features: String,
-    /// Results of the plans on all rooms with seed 0, the paper's preset first.
-    pub on_all_rooms: Vec<PlanResult>,
+    /// Results on all rooms, the paper's preset first.
+    pub on_all_rooms: Vec<KindResults>,
     /// Results of the paper's preset, by increasing number of rooms.
     pub by_size: Vec<SizeResults>,
     /// Results of the paper's preset on all rooms, in the second visits of the held-out rooms that
@@ -137,9 +143,14 @@ pub struct SetResults {
 }
 
 impl SetResults {
-    /// The baseline of all comparisons: the paper's preset on all rooms, seed 0.
-    pub fn baseline(&self) -> &PlanResult {
-        &self.on_all_rooms[0]
+    /// The baseline of all comparisons: the paper's preset on all rooms, by seed.
+    pub fn baseline(&self) -> &[CrossRoomRun] {
+        &self.on_all_rooms[0].runs
+    }
+
+    /// The paper's preset on all rooms, seed 0.
+    pub fn first_baseline(&self) -> &CrossRoomRun {
+        &self.baseline()[0]
     }
 }
 
@@ -182,32 +193,40 @@ fn evaluate_set(
     let second_visits = in_second_visits(given, set, baseline)?;
 
     let mut by_size: BTreeMap<usize, Vec<CrossRoomRun>> = BTreeMap::new();
-    let mut on_all_rooms = Vec::new();
-    for (result, adapter) in results {
-        let plan = result.plan;
-        if plan.kind == PlanKind::PaperRange {
-            let runs = by_size.entry(plan.rooms).or_default();
-            runs.push(result.run.clone());
-        }
+    let mut by_kind: BTreeMap<PlanKind, Vec<CrossRoomRun>> = BTreeMap::new();
+    for (PlanResult { plan, run }, adapter) in results {
         // The other seeds show the spread of a training; their adapters are not published.
         if plan.seed == 0 {
             notes.adapters.push(adapter);
-            if plan.rooms == set.train.len() {
-                on_all_rooms.push(result);
-            }
+        }
+        if plan.rooms == set.train.len() {
+            by_kind.entry(plan.kind).or_default().push(run.clone());
+        }
+        if plan.kind == PlanKind::PaperRange {
+            by_size.entry(plan.rooms).or_default().push(run);
         }
     }
 
-    // The paper's preset comes first; the others keep the order of the plans.
-    on_all_rooms.sort_by_key(|result| result.plan.kind != PlanKind::PaperRange);
-    let by_size = by_size.into_iter().map(|(rooms, mut runs)| {
+    let by_seed = |mut runs: Vec<CrossRoomRun>| {
         runs.sort_by_key(|run| run.seed);
-        SizeResults { rooms, runs }
-    });
+        runs
+    };
     Ok(SetResults {
         features: set.features.clone(),
-        on_all_rooms,
-        by_size: by_size.collect(),
+        on_all_rooms: by_kind
+            .into_iter()
+            .map(|(kind, runs)| KindResults {
+                kind,
+                runs: by_seed(runs),
+            })
+            .collect(),
+        by_size: by_size
+            .into_iter()
+            .map(|(rooms, runs)| SizeResults {
+                rooms,
+                runs: by_seed(runs),
+            })
+            .collect(),
         second_visits,
     })
 }
@@ -215,15 +234,13 @@ fn evaluate_set(
 /// All plans, longest training first, so that no long training runs alone at the end.
 fn plans(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Vec<AdapterPlan> {
     let all = set.train.len();
-    let on_all_rooms = |kind| AdapterPlan {
-        kind,
-        rooms: all,
-        seed: 0,
+    let trainings = |kind, rooms| {
+        let seeds = 0..given.options.trainings;
+        seeds.map(move |seed| AdapterPlan { kind, rooms, seed })
     };
-    let mut plans = vec![
-        on_all_rooms(PlanKind::PaperRangeCalibrated),
-        on_all_rooms(PlanKind::EnsembleCalibrated),
-    ];
+    let mut plans = Vec::new();
+    plans.extend(trainings(PlanKind::PaperRangeCalibrated, all));
+    plans.extend(trainings(PlanKind::EnsembleCalibrated, all));
 
     // The scaling curve of the paper's preset. All rooms are its last point, listed or not.
     let mut sizes = given.options.sizes.clone();
@@ -231,15 +248,12 @@ fn plans(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Vec<AdapterPlan> {
     sizes.sort_unstable();
     sizes.dedup();
     for rooms in sizes.into_iter().rev() {
-        plans.extend((0..given.options.trainings).map(|seed| AdapterPlan {
-            kind: PlanKind::PaperRange,
-            rooms,
-            seed,
-        }));
+        plans.extend(trainings(PlanKind::PaperRange, rooms));
     }
 
     // Preset steady needs only a fraction of the steps.
-    plans.extend([PlanKind::Steady, PlanKind::SteadyCalibrated].map(on_all_rooms));
+    plans.extend(trainings(PlanKind::Steady, all));
+    plans.extend(trainings(PlanKind::SteadyCalibrated, all));
     plans
 }
 
@@ -365,7 +379,7 @@ fn training_plan(given: &Reproduction<'_>, of: AdapterPlan) -> TrainingPlan {
 }
 
 /// The navigators of the cross-room tables. Calibrated retrieval needs the error covariance from
-/// calibration rooms. The other seeds are for the scaling curve alone.
+/// calibration rooms. Only seed 0 has the rows that no other training is compared with.
 fn navigators(plan: &AdapterPlan) -> Vec<NavigatorKind> {
     let affine = StepKind::InversePoincare(Reading::Affine);
     let homogeneous = StepKind::InversePoincare(Reading::Homogeneous);
@@ -380,21 +394,35 @@ fn navigators(plan: &AdapterPlan) -> Vec<NavigatorKind> {
     let mut navigators = vec![
         NavigatorKind::Identity,
         NavigatorKind::Step(affine, RetrievalMetric::Full),
-    ];
-    if plan.seed != 0 {
-        return navigators;
-    }
-    navigators.extend([
         NavigatorKind::Step(homogeneous, RetrievalMetric::Full),
-        NavigatorKind::Step(refit(true), RetrievalMetric::Full),
-        NavigatorKind::Step(refit(false), RetrievalMetric::Full),
-        NavigatorKind::Step(affine, RetrievalMetric::RowSpace),
-        NavigatorKind::Step(affine, RetrievalMetric::Whitened),
-    ]);
+    ];
+    if plan.seed == 0 {
+        navigators.extend([
+            NavigatorKind::Step(refit(true), RetrievalMetric::Full),
+            NavigatorKind::Step(refit(false), RetrievalMetric::Full),
+            NavigatorKind::Step(affine, RetrievalMetric::RowSpace),
+            NavigatorKind::Step(affine, RetrievalMetric::Whitened),
+        ]);
+    }
     if plan.kind.is_calibrated() {
         let calibrated = NavigatorKind::Step(homogeneous, RetrievalMetric::Calibrated);
         navigators.push(calibrated);
     }
 
     navigators
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use seese3_testing::recording;
+
+    /// Oracle: the test recording has six sequences of 50 frames: the first is learned from.
+    #[test]
+    fn refits_learn_the_first_visit_alone() {
+        let room = recording::room("a");
+        let view = first_visit_learned(&room).unwrap();
+        let expected: Vec<bool> = (0..300).map(|row| row >= 50).collect();
+        assert_eq!(view.timeline().held_out, expected);
+    }
 }
