@@ -20,7 +20,8 @@ use seese3_core::geometry::Pose;
 use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::splits::{Pair, Split};
 use seese3_lab::benchmark::{
-    Benchmark, Error, FeatureMetrics, MetricMeans, RoomMetrics, Submission, score,
+    Benchmark, BenchmarkScores, Described, Error, FeatureMetrics, MetricMeans, RoomMetrics,
+    Submission, check_description, check_submission_text, score,
 };
 use seese3_lab::report::{benchmark_page, benchmark_table, metrics_page, metrics_table};
 use seese3_store::Store;
@@ -139,7 +140,7 @@ struct ProbeFeatures {
     /// Name of the feature set, the same for every room
     #[arg(long)]
     features: String,
-    /// Name of the features in the table; that of the feature set if omitted
+    /// Name of the features in the table; default: the feature set's name
     #[arg(long)]
     name: Option<String>,
     /// One sentence: the encoder, its weights, the layer and the pooling
@@ -183,17 +184,17 @@ impl BenchmarkCommand {
 impl Freeze {
     async fn run(self) -> anyhow::Result<()> {
         begin_output(&self.out)?;
+        ensure!(
+            !self.out.exists(),
+            "--out: {} exists; a benchmark that was frozen stays as it is. Give another name",
+            self.out.display()
+        );
         let store = Store::open(&self.store)?;
         let mut rooms = Vec::new();
         for name in room_names(&store, &self.rooms).await? {
             rooms.push(store.load_room(&name, None).await?.room);
         }
 
-        ensure!(
-            !self.out.exists(),
-            "--out: {} exists; a benchmark that was frozen stays as it is. Give another name",
-            self.out.display()
-        );
         let benchmark = Benchmark::freeze(&self.name, &rooms, self.split, self.stride)?;
         let pairs: usize = benchmark.rooms.iter().map(|room| room.pair_count()).sum();
         say(format_args!(
@@ -210,6 +211,7 @@ impl Answer {
     async fn run(self) -> anyhow::Result<()> {
         begin_output(&self.out)?;
         let benchmark = read_benchmark(&self.benchmark)?;
+        check_submission_text(&self.name, &self.about)?;
         let store = Store::open(&self.store)?;
         let adapter = store.load_adapter(&self.adapter, None).await?.adapter;
         let navigators = navigators_named(std::slice::from_ref(&self.navigator))?;
@@ -238,7 +240,7 @@ impl Answer {
             let pairs: Vec<Pair> = scored.iter().map(|scored| scored.pair).collect();
             ensure!(
                 pairs == frozen.pairs(benchmark.stride),
-                "room '{}': this version makes other pairs of the split '{}' than the benchmark has",
+                "room '{}': this version's split '{}' yields other pairs than the benchmark has; use the version that froze it",
                 frozen.room,
                 benchmark.split
             );
@@ -302,19 +304,13 @@ impl Score {
         // Standing still is always in the table.
         let mut all = vec![benchmark.standing_still()];
         all.extend(submissions);
-        let mut scores: Vec<_> = all
+        let mut scores: Vec<BenchmarkScores> = all
             .iter()
             .map(|submission| score(&benchmark, submission, &poses))
             .collect();
-        let first = |index: usize, scores: &[seese3_lab::benchmark::BenchmarkScores]| {
-            scores[index].hits.first().map_or(0.0, |hits| hits.hit.mean)
-        };
-        let mut order: Vec<usize> = (0..scores.len()).collect();
-        order.sort_by(|&a, &b| first(b, &scores).total_cmp(&first(a, &scores)));
-        scores = order
-            .into_iter()
-            .map(|index| scores[index].clone())
-            .collect();
+        let first_hit =
+            |scores: &BenchmarkScores| scores.hits.first().map_or(0.0, |hits| hits.hit.mean);
+        scores.sort_by(|a, b| first_hit(b).total_cmp(&first_hit(a)));
 
         self.files.say(&benchmark_table(&scores), &benchmark.name)?;
         if let Some(page) = &self.page {
@@ -331,8 +327,9 @@ impl ProbeFeatures {
     async fn run(self) -> anyhow::Result<()> {
         begin_output(&self.out)?;
         let benchmark = read_benchmark(&self.benchmark)?;
-        let store = Store::open(&self.store)?;
         let name = self.name.as_ref().unwrap_or(&self.features);
+        check_description(name, &self.about, None)?;
+        let store = Store::open(&self.store)?;
 
         // One room after the other; within a room, the seeds of M4 are trained in parallel.
         let progress = bar(benchmark.rooms.len() as u64, "probing");
@@ -360,7 +357,15 @@ impl ProbeFeatures {
         progress.finish_and_clear();
 
         let source = source.context("the benchmark has no rooms")?;
-        let metrics = FeatureMetrics::new(&benchmark, [name, &self.about], source, rooms);
+        let metrics = FeatureMetrics::new(
+            &benchmark,
+            Described {
+                name,
+                about: &self.about,
+                source,
+            },
+            rooms,
+        );
         metrics.check(&benchmark)?;
         write_json(&self.out, &metrics)?;
         say(metrics_table(&[MetricMeans::of(&metrics)]));

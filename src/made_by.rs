@@ -112,8 +112,7 @@ fn seed(matches: &ArgMatches) -> Option<u64> {
     values.next()?.to_str()?.parse().ok()
 }
 
-/// The store, if it is that of the variable SEESE3_STORE. No other variable is recorded: those of
-/// the client are secrets.
+/// The store, if it is that of the variable SEESE3_STORE.
 fn store_variable(matches: &ArgMatches) -> Option<OsString> {
     let matches = innermost(matches);
     let mut values = matches.try_get_raw("store").ok()??;
@@ -141,7 +140,8 @@ fn quoted(store: Option<&OsStr>, arguments: &[OsString]) -> String {
     words.chain(options).collect::<Vec<_>>().join(" ")
 }
 
-/// A word for a POSIX shell. Bytes that are not UTF-8 are written as `$'\xFF'`.
+/// A word for a POSIX shell. Bytes that are not UTF-8 are written as `$'\xFF'`, which bash, zsh and
+/// ksh read.
 fn quoted_word(word: &OsStr) -> String {
     let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./:=,@%+".contains(c);
     let Some(text) = word.to_str() else {

@@ -194,8 +194,11 @@ pub fn not_built(what: &str, feature: &str) -> anyhow::Error {
     )
 }
 
-/// Called for each output before a long computation starts. Rejects a file in a missing folder, and
-/// a second output to the same file. "-" turns text output off.
+/// Registers an output, before a long computation starts. "-" is standard output, and turns text
+/// output off.
+///
+/// # Errors
+/// A folder, a file in a missing folder, and a second output to the same file.
 pub fn begin_output(path: &Path) -> anyhow::Result<()> {
     if is_standard_output(path) {
         silence();

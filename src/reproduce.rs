@@ -1,6 +1,6 @@
 //! `seese3 reproduce`: the paper's tables and figures on given rooms, as one report.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
@@ -56,7 +56,8 @@ pub struct Reproduce {
     /// Numbers of training rooms along the scaling curve
     #[arg(long, value_delimiter = ',', default_values_t = [5, 10, 20, 35, 50, 75, 100])]
     sizes: Vec<usize>,
-    /// Number of trainings of every size, each with another choice of rooms and another seed; 1 to 100
+    /// Number of seeds of every adapter that is trained on several rooms; the seed also chooses its
+    /// rooms; 1 to 100
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..=100))]
     trainings: u64,
     /// Features of several layers of one encoder, separated by commas, to be compared in the rooms
@@ -240,8 +241,8 @@ struct FolderJournal {
     folder: PathBuf,
     store: Store,
     runtime: Handle,
-    /// The commits of the program that made the parts which were read.
-    commits: Mutex<BTreeSet<String>>,
+    /// The commits of the program that made the parts which were read, by part.
+    commits: Mutex<BTreeMap<String, String>>,
 }
 
 /// The key of a part's commit in its file.
@@ -269,12 +270,14 @@ impl FolderJournal {
         })
     }
 
-    /// The commits of the program that made the parts which were read, other than this program's.
+    /// The commits of the program that made the reused parts, other than this program's.
     fn other_commits(&self) -> Vec<String> {
         let commits = self.commits.lock().unwrap_or_else(PoisonError::into_inner);
-        let others = commits.iter();
-        let others = others.filter(|&commit| Some(commit.as_str()) != made_by::COMMIT);
-        others.cloned().collect()
+        let others = commits.values().cloned().collect::<BTreeSet<String>>();
+        let others = others.into_iter();
+        others
+            .filter(|commit| Some(commit.as_str()) != made_by::COMMIT)
+            .collect()
     }
 
     fn file(&self, part: &str) -> PathBuf {
@@ -294,12 +297,17 @@ impl Journal for FolderJournal {
         let part = part.map_err(|error| format!("{}: {error}; remove it", file.display()))?;
         if let Some(commit) = part.get(COMMIT).and_then(Value::as_str) {
             let mut commits = self.commits.lock().unwrap_or_else(PoisonError::into_inner);
-            commits.insert(commit.to_owned());
+            commits.insert(name.to_owned(), commit.to_owned());
         }
         Ok(Some(part))
     }
 
     fn keep_part(&self, name: &str, part: &Value) -> Result<(), String> {
+        // A part that was read has other inputs, and is replaced.
+        let mut commits = self.commits.lock().unwrap_or_else(PoisonError::into_inner);
+        commits.remove(name);
+        drop(commits);
+
         let mut part = part.clone();
         if let Some(part) = part.as_object_mut() {
             part.insert(COMMIT.to_owned(), json!(made_by::COMMIT));

@@ -79,9 +79,9 @@ pub struct CrossedMean {
     pub p: f64,
 }
 
-/// The mean of values by training and room: `by_training[k][r]` is the value of room r with
-/// training k. `None` with fewer than two trainings or rooms, or if all values are equal and not
-/// zero: their spread is unknown.
+/// The mean of finite values by training and room: `by_training[k][r]` is the value of room r with
+/// training k; every training has the same rooms. `None` with fewer than two trainings or rooms, or
+/// if all room means and all training means are equal and not zero: their spread is unknown.
 ///
 /// Its variance is the variance of the room means over the number of rooms, plus the variance of
 /// the training means over the number of trainings. That counts the residual twice, so the
@@ -109,7 +109,8 @@ pub fn crossed_mean(by_training: &[Vec<f64>]) -> Option<CrossedMean> {
     let [of_rooms, of_trainings] =
         [&room_means, &training_means].map(|means| deviation(means).powi(2) / means.len() as f64);
     let variance = of_rooms + of_trainings;
-    if variance == 0.0 {
+    // Rounding leaves equal values a variance of about (1e-16 times the mean)².
+    if variance <= (1e-12 * center).powi(2) {
         // Equal values show no spread: they are no evidence for a mean that is not zero.
         return (center == 0.0).then_some(CrossedMean {
             mean: center,

@@ -69,25 +69,18 @@ pub struct RoomMetrics {
 impl RoomMetrics {
     /// Measures the features of a room. `stride` is that of the benchmark, in frames.
     ///
-    /// M1: 256 frames at an even stride, k 10, 10 frames to each side left out. M2: without a gap.
-    /// M3 and M4: five folds, whose test pairs are scored together; M4: preset `base`, seeds 0 to 2.
+    /// M1: at most 256 frames at the smallest stride that spans the recording, k 10, 10 of them to
+    /// each side left out. M2: without a gap. M3 and M4: five folds, whose test pairs are scored together; M4: preset `base`, seeds 0 to 2.
     ///
     /// # Errors
     /// [`experiments::Error`] with the name of the failed metric; a metric that is not a number.
     pub fn measure(data: &RoomData<'_>, stride: u32) -> Result<Self, experiments::Error> {
-        let paper = MutualKnn::default();
-        let frames = paper.frames.min(data.room.frame_count());
-        let mutual_knn = MutualKnn {
-            frames,
-            stride: data.room.frame_count() / frames.max(1),
-            ..paper
-        };
         // The splits of the plans are replaced by those of the protocol.
         let plan = TrainingPlan::of(Preset::Base, Split::Whole, stride, 0);
         let scores = probe(
             data,
             &ProbeProtocol {
-                m1: Some(mutual_knn),
+                m1: Some(MutualKnn::spanning(data.room.frame_count())),
                 m2: Some(DimensionProtocol { gap: 0 }),
                 m3: vec![plan.clone()],
                 m4: vec![plan],
@@ -96,21 +89,24 @@ impl RoomMetrics {
             },
         )?;
 
-        let ridge = scores.m3.first();
-        let constant = ridge.and_then(|ridge| ridge.baselines);
-        let dimension = scores.m2.map(|m2| m2.dimension);
-        let or_nan = |value: Option<f64>| value.unwrap_or(f64::NAN);
+        let (Some(m1), Some(m2)) = (scores.m1, scores.m2) else {
+            return Err(undefined("m1 or m2"));
+        };
+        let (Some(ridge), Some(adapter)) = (scores.m3.first(), scores.m4.first()) else {
+            return Err(undefined("m3 or m4"));
+        };
+        let constant = ridge.baselines.ok_or_else(|| undefined("constant"))?;
         let metrics = Self {
-            m1: or_nan(scores.m1.map(|m1| m1.share)),
-            m2_twonn: or_nan(dimension.as_ref().map(|found| found.two_nn.linear)),
-            m2_mle: or_nan(dimension.map(|found| found.mle_biased.harmonic)),
-            m3: or_nan(ridge.map(|ridge| ridge.r2)),
-            m4: or_nan(scores.m4.first().map(|adapter| adapter.r2)),
-            constant: or_nan(constant.map(|constant| constant.constant_r2)),
+            m1: m1.share,
+            m2_twonn: m2.dimension.two_nn.linear,
+            m2_mle: m2.dimension.mle_biased.harmonic,
+            m3: ridge.r2,
+            m4: adapter.r2,
+            constant: constant.constant_r2,
         };
 
         match metrics.not_finite() {
-            Some(name) => Err(experiments::Error::Input(format!("{name} is not a number"))),
+            Some(name) => Err(undefined(name)),
             None => Ok(metrics),
         }
     }
@@ -136,22 +132,33 @@ impl RoomMetrics {
     }
 }
 
+fn undefined(metric: &str) -> experiments::Error {
+    experiments::Error::Input(format!(
+        "{metric} is undefined: all features or all motions of the room are equal"
+    ))
+}
+
+/// The texts and the features of a file of metrics.
+pub struct Described<'a> {
+    /// As [`FeatureMetrics::name`].
+    pub name: &'a str,
+    /// As [`FeatureMetrics::about`].
+    pub about: &'a str,
+    /// As [`FeatureMetrics::source`].
+    pub source: FeatureSource,
+}
+
 impl FeatureMetrics {
     /// The metrics of the rooms of a benchmark, in its order.
-    pub fn new(
-        benchmark: &Benchmark,
-        [name, about]: [&str; 2],
-        source: FeatureSource,
-        rooms: Vec<RoomMetrics>,
-    ) -> Self {
+    pub fn new(benchmark: &Benchmark, features: Described<'_>, rooms: Vec<RoomMetrics>) -> Self {
         let names = benchmark.rooms.iter().map(|room| room.room.clone());
         Self {
             format: METRICS_FORMAT.to_owned(),
             benchmark: benchmark.sha256(),
-            name: name.to_owned(),
-            about: about.to_owned(),
+            name: features.name.to_owned(),
+            about: features.about.to_owned(),
             url: None,
-            source,
+            source: features.source,
             rooms: names.zip(rooms).collect(),
             made_by: IgnoredAny,
         }
@@ -205,7 +212,7 @@ impl FeatureMetrics {
 pub struct MetricMeans {
     /// The name of the features.
     pub name: String,
-    /// What the file says about them.
+    /// The `about` text of the file.
     pub about: String,
     /// Where the encoder is described.
     pub url: Option<String>,

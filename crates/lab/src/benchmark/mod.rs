@@ -6,7 +6,7 @@
 
 mod metrics;
 
-pub use metrics::{FeatureMetrics, MetricMeans, RoomMetrics};
+pub use metrics::{Described, FeatureMetrics, MetricMeans, RoomMetrics};
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -164,7 +164,7 @@ impl Benchmark {
     /// Freezes the test pairs of a split in these rooms.
     ///
     /// # Errors
-    /// [`Error`] if a room has no test pair.
+    /// [`Error`] if a room has no test pair, or the name is not valid.
     pub fn freeze<'a>(
         name: &str,
         rooms: impl IntoIterator<Item = &'a Room>,
@@ -186,14 +186,16 @@ impl Benchmark {
             })
         };
 
-        Ok(Self {
+        let benchmark = Self {
             format: BENCHMARK_FORMAT.to_owned(),
             name: name.to_owned(),
             split: split.name().to_owned(),
             stride,
             thresholds: default_thresholds(),
             rooms: rooms.into_iter().map(frozen).collect::<Result<_, _>>()?,
-        })
+        };
+        benchmark.check()?;
+        Ok(benchmark)
     }
 
     /// SHA-256 of the benchmark as compact JSON, as hexadecimal digits.
@@ -248,10 +250,7 @@ impl Benchmark {
         for room in &self.rooms {
             room.check(self.stride)?;
             if !names.insert(&room.room) {
-                return Err(Error::new(
-                    format!("room '{}'", room.room),
-                    "is there twice",
-                ));
+                return Err(Error::new(format!("room '{}'", room.room), "occurs twice"));
             }
         }
         Ok(())
@@ -366,12 +365,7 @@ impl Submission {
         check_format(&self.format, SUBMISSION_FORMAT)?;
         check_benchmark(&self.benchmark, benchmark)?;
         check_description(&self.name, &self.about, self.url.as_deref())?;
-        if self.name == IDENTITY {
-            return Err(Error::new(
-                "name",
-                "is that of the baseline; choose another",
-            ));
-        }
+        check_submission_text(&self.name, &self.about)?;
 
         let known = |name: &String| benchmark.rooms.iter().any(|room| room.room == *name);
         if let Some(other) = self.frames.keys().find(|name| !known(name)) {
@@ -407,7 +401,7 @@ impl Submission {
 pub struct BenchmarkScores {
     /// The name of the method.
     pub name: String,
-    /// What the submission says about it.
+    /// The `about` text of its file.
     pub about: String,
     /// Where it is described.
     pub url: Option<String>,
@@ -490,8 +484,24 @@ fn check_benchmark(sha256: &str, benchmark: &Benchmark) -> Result<(), Error> {
     Ok(())
 }
 
-/// Checks what a file says about its method.
-fn check_description(name: &str, about: &str, url: Option<&str>) -> Result<(), Error> {
+/// Checks the name and the `about` text of a submission.
+///
+/// # Errors
+/// [`Error`] names the field.
+pub fn check_submission_text(name: &str, about: &str) -> Result<(), Error> {
+    check_description(name, about, None)?;
+    if name == IDENTITY {
+        let problem = format!("'{IDENTITY}' is reserved for the baseline; choose another");
+        return Err(Error::new("name", problem));
+    }
+    Ok(())
+}
+
+/// Checks the name, the `about` text and the address of a file.
+///
+/// # Errors
+/// [`Error`] names the field.
+pub fn check_description(name: &str, about: &str, url: Option<&str>) -> Result<(), Error> {
     check_text("name", name)?;
     check_text("about", about)?;
 
@@ -499,7 +509,8 @@ fn check_description(name: &str, about: &str, url: Option<&str>) -> Result<(), E
         let is_address = url.starts_with("https://") || url.starts_with("http://");
         let is_plain = |c: char| c.is_ascii_graphic() && !"<>()[]\"`".contains(c);
         if !is_address || !url.chars().all(is_plain) {
-            let problem = "must be an address that begins with https://";
+            let problem =
+                "must be an address http://… or https://… without spaces, quotes or brackets";
             return Err(Error::new("url", problem));
         }
     }
@@ -624,7 +635,7 @@ mod tests {
         assert!(wrong(&|it| it.rooms.clear()).starts_with("rooms: "));
         assert!(wrong(&|it| it.stride = 0).starts_with("stride: "));
         assert!(wrong(&|it| it.split = "other".to_owned()).starts_with("split: "));
-        assert!(wrong(&|it| it.rooms.push(it.rooms[0].clone())).contains("is there twice"));
+        assert!(wrong(&|it| it.rooms.push(it.rooms[0].clone())).contains("occurs twice"));
         let overlap = wrong(&|it| it.rooms[0].sources = vec![[0, 9], [5, 12]]);
         assert!(overlap.contains("overlap"), "{overlap}");
         let inverted = wrong(&|it| it.rooms[0].candidates = vec![[9, 0]]);

@@ -64,6 +64,17 @@ pub enum Limit {
 }
 
 impl MutualKnn {
+    /// The paper's options, with at most 256 frames at the smallest stride that spans a recording.
+    pub fn spanning(frame_count: usize) -> Self {
+        let paper = Self::default();
+        let stride = frame_count.div_ceil(paper.frames).max(1);
+        Self {
+            frames: frame_count.div_ceil(stride),
+            stride,
+            ..paper
+        }
+    }
+
     /// Whether two sampled frames may be neighbors.
     fn apart(&self, frame: usize, other: usize) -> bool {
         let distance = match self.counted {

@@ -7,7 +7,7 @@
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use seese3_core::statistics::{
-    CrossedMean, RoomMean, bootstrap_mean, crossed_mean, holm, sign_flip_p,
+    CrossedMean, RoomMean, bootstrap_mean, crossed_mean, holm, mean, sign_flip_p,
 };
 
 use crate::report::Column::{self, Text};
@@ -40,7 +40,7 @@ pub struct Case {
     pub mean: Option<RoomMean>,
     /// Number of trainings with different seeds, where their spread is part of the interval.
     pub trainings: Option<usize>,
-    /// Two-sided p-value: of values that are symmetric around zero, or with several trainings of a
+    /// Two-sided p-value: of the sign-flip test; with several trainings, of Student's t test of a
     /// mean of zero.
     pub p: Option<f64>,
     /// The same with Holm's correction for all tests of the report.
@@ -99,7 +99,11 @@ impl Case {
     }
 
     /// The differences `ours − theirs`, paired by training and room.
-    pub fn of_differences(case: impl Into<String>, ours: &[Vec<f64>], theirs: &[Vec<f64>]) -> Self {
+    pub fn of_paired_trainings(
+        case: impl Into<String>,
+        ours: &[Vec<f64>],
+        theirs: &[Vec<f64>],
+    ) -> Self {
         match &differences(ours, theirs)[..] {
             [alone] => Self::of_rooms(case, alone),
             several => Self::of_trainings(case, several),
@@ -109,19 +113,14 @@ impl Case {
     /// A value per training and room, with the spread of both; see [`crossed_mean`]. Rooms with a
     /// value that is not finite are left out.
     pub fn of_trainings(case: impl Into<String>, by_training: &[Vec<f64>]) -> Self {
-        let all = by_training.first().map_or(0, Vec::len);
-        let is_known = |&room: &usize| by_training.iter().all(|values| values[room].is_finite());
-        let known: Vec<usize> = (0..all).filter(is_known).collect();
-        let of_known = |values: &Vec<f64>| known.iter().map(|&room| values[room]).collect();
-        let by_training: Vec<Vec<f64>> = by_training.iter().map(of_known).collect();
-        let rooms = known.len();
-
-        let Some(crossed) = crossed_mean(&by_training) else {
+        let known = known_rooms(by_training);
+        let rooms = known.first().map_or(0, Vec::len);
+        let Some(crossed) = crossed_mean(&known) else {
             let reason = format!(
                 "{} trainings in {rooms} rooms: their spread is unknown",
-                by_training.len()
+                known.len()
             );
-            return Self::untested(case, by_training.first().map(Vec::as_slice), &reason);
+            return Self::untested(case, Some(&means_of_rooms(&known)), &reason);
         };
         Self {
             case: case.into(),
@@ -171,13 +170,33 @@ pub fn differences(ours: &[Vec<f64>], theirs: &[Vec<f64>]) -> Vec<Vec<f64>> {
 }
 
 /// The mean over trainings and rooms with the spread of both; of one training, or where the spread
-/// is unknown, over the rooms alone.
+/// is unknown, with that of the rooms alone. Rooms with a value that is not finite are left out.
 pub fn mean_over_trainings(by_training: &[Vec<f64>]) -> RoomMean {
-    let alone = by_training.first().map_or(&[][..], Vec::as_slice);
-    match crossed_mean(by_training) {
-        Some(crossed) => room_mean(&crossed, alone.len()),
-        None => bootstrap_mean(alone, 0),
+    let known = known_rooms(by_training);
+    let rooms = means_of_rooms(&known);
+    match crossed_mean(&known) {
+        Some(crossed) => room_mean(&crossed, rooms.len()),
+        None => bootstrap_mean(&rooms, 0),
     }
+}
+
+/// The values of the rooms in which every training has a finite one.
+fn known_rooms(by_training: &[Vec<f64>]) -> Vec<Vec<f64>> {
+    let all = by_training.iter().map(Vec::len).min().unwrap_or(0);
+    let is_known = |&room: &usize| by_training.iter().all(|values| values[room].is_finite());
+    let known: Vec<usize> = (0..all).filter(is_known).collect();
+    let of_known = |values: &Vec<f64>| known.iter().map(|&room| values[room]).collect();
+    by_training.iter().map(of_known).collect()
+}
+
+/// The mean over trainings for each room.
+fn means_of_rooms(by_training: &[Vec<f64>]) -> Vec<f64> {
+    let rooms = by_training.first().map_or(0, Vec::len);
+    let of_room = |room: usize| {
+        let values: Vec<f64> = by_training.iter().map(|values| values[room]).collect();
+        mean(&values)
+    };
+    (0..rooms).map(of_room).collect()
 }
 
 fn room_mean(crossed: &CrossedMean, rooms: usize) -> RoomMean {
@@ -196,7 +215,7 @@ pub enum Verdict {
     Confirmed,
     /// The claim fails in every case.
     Contradicted,
-    /// Some cases are decided, and not all of them alike or not all.
+    /// Some cases are decided, but not all, or they disagree.
     Mixed,
     /// No case is decided.
     CannotTell,
@@ -241,11 +260,12 @@ impl Verdict {
     }
 }
 
-/// The feature sets, or their results, without the control, which is the last one of several.
-pub fn without_control<T>(sets: &[T]) -> &[T] {
+/// The feature sets, or their results, of trained encoders, and the control: the last one of
+/// several.
+pub fn encoders_and_control<T>(sets: &[T]) -> (&[T], Option<&T>) {
     match sets {
-        [encoders @ .., _control] if !encoders.is_empty() => encoders,
-        all => all,
+        [encoders @ .., control] if !encoders.is_empty() => (encoders, Some(control)),
+        all => (all, None),
     }
 }
 
@@ -273,7 +293,7 @@ pub fn section(claims: &[Claim]) -> Section {
         Text("claim", |(_, claim)| claim.claim.clone()),
         Text("here", |(_, claim)| claim.verdict.word().to_owned()),
         Text("decided", |(_, claim)| counts(claim)),
-        Text("above zero where it holds", |(_, claim)| {
+        Text("quantity, above 0 if the claim holds", |(_, claim)| {
             claim.tested.clone()
         }),
         Text("tests", |(number, _)| number.to_string()),
@@ -419,9 +439,9 @@ mod tests {
             mean_over_trainings(&found[..1]),
             bootstrap_mean(&found[0], 0)
         );
-        let case = Case::of_differences("x", &ours, &theirs);
+        let case = Case::of_paired_trainings("x", &ours, &theirs);
         assert_eq!((case.trainings, case.mean), (Some(2), Some(both)));
-        let case = Case::of_differences("x", &ours[..1], &theirs[..1]);
+        let case = Case::of_paired_trainings("x", &ours[..1], &theirs[..1]);
         assert_eq!(case.trainings, None);
     }
 }

@@ -7,7 +7,7 @@ use seese3_core::adapter::Preset;
 use seese3_core::splits::Split;
 use seese3_core::statistics::mean_of_known;
 
-use super::claims::{Case, Claim};
+use super::claims::{Case, Claim, encoders_and_control};
 use super::{Error, FeatureSet, Found, Reproduction, paper};
 use crate::experiments::cross_room::clipped_r2;
 use crate::experiments::formulations::{
@@ -15,13 +15,12 @@ use crate::experiments::formulations::{
 };
 use crate::report::{Section, Table, add_formulations, fixed};
 
-/// Fewest rooms and seeds that decide which formulation is best. Rooms have to be those that the
-/// run was given, not some of them chosen by a score.
+/// Minimum number of rooms and of seeds for a test. The rooms must not be selected by a score.
 const FEWEST_ROOMS: usize = 12;
 const FEWEST_SEEDS: usize = 5;
 /// Epochs of the paper's training.
 const PAPER_EPOCHS: usize = 200;
-/// A block in five of the recording is tested, so that the test motions are like the others.
+/// Every fifth block is tested, so that training and test motions have similar distributions.
 const SPLIT: Split = Split::Blocks;
 
 /// JSON record of the formulations with one feature set.
@@ -34,10 +33,7 @@ pub struct FormulationRecord {
 }
 
 /// Builds the section that compares the adapter with the alternatives A to D.
-pub fn section(
-    given: &Reproduction<'_>,
-    claims: &mut Vec<Claim>,
-) -> Result<Found<Vec<FormulationRecord>>, Error> {
+pub fn section(given: &Reproduction<'_>) -> Result<Found<Vec<FormulationRecord>>, Error> {
     let mut section = Section::new("Alternatives A to D");
 
     let mut record = Vec::new();
@@ -70,7 +66,7 @@ pub fn section(
     }
 
     section.text(format!(
-        "Means over the {} rooms that are learned alone, stride {}, split {SPLIT}: mean ± sd over seeds of the mean over \
+        "Means over the {} in-room rooms, stride {}, split {SPLIT}: mean ± sd over seeds of the mean over \
          rooms. The claim is tested on the paper's training, over rooms, with at least {FEWEST_ROOMS} rooms and \
          {FEWEST_SEEDS} seeds; R² of a room counts as max(R², −1).",
         given.sets[0].in_room.len(),
@@ -84,13 +80,16 @@ pub fn section(
             "the paper's training was not run",
         ));
     }
-    claims.push(Claim::new(
-        "the adapter's W(φ(z₂) − φ(z₁)) reads motion better than the alternatives A to D",
-        "max(R², −1) of the adapter minus that of the alternative, mean over seeds",
+    let claim = Claim::new(
+        "the adapter's W(φ(z₂) − φ(z₁)) estimates motion better than the alternatives A to D",
+        "max(R², −1) of the mean over seeds, the adapter's minus that of the alternative",
         cases,
-    ));
-
-    Ok(Found { section, record })
+    );
+    Ok(Found {
+        section,
+        record,
+        claims: vec![claim],
+    })
 }
 
 /// The adapter's R² minus that of each alternative, by room.
@@ -142,7 +141,7 @@ fn table(compared: &Comparison) -> Table {
 enum Training {
     /// Preset base.
     Base,
-    /// The paper's preset, 200 epochs of 30,000 pairs: 30 times as many steps.
+    /// The paper's preset for `formulation_epochs` epochs.
     Paper,
 }
 
@@ -175,10 +174,7 @@ impl Training {
 /// The short training with every feature set but the control, whose adapters estimate no motion
 /// (see the section on strides), and the long one with the first set, if it is wanted.
 fn runs<'a>(given: &'a Reproduction<'a>) -> Vec<(Training, &'a FeatureSet<'a>)> {
-    let sets = match &given.sets[..] {
-        [trained @ .., _control] if !trained.is_empty() => trained,
-        all => all,
-    };
+    let (sets, _) = encoders_and_control(&given.sets);
 
     let is_long_training_wanted = given.options.formulation_epochs > 0;
     let long = is_long_training_wanted.then_some((Training::Paper, &given.sets[0]));

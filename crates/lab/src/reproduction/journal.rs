@@ -5,10 +5,9 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
-use super::{Claim, Found, ReproducedAdapter, Reproduction};
+use super::{Found, ReproducedAdapter, Reproduction};
 use crate::experiments::Error;
 use crate::experiments::adapter_sweep::content;
-use crate::report::Section;
 use seese3_core::adapter::{Adapter, TrainingRecord};
 use seese3_core::training::RoomData;
 
@@ -54,14 +53,6 @@ impl Journal for NoJournal {
 struct Kept<T> {
     inputs: Value,
     result: T,
-}
-
-/// The result of a step.
-#[derive(Serialize, Deserialize)]
-struct Step {
-    section: Section,
-    record: Value,
-    claims: Vec<Claim>,
 }
 
 impl Reproduction<'_> {
@@ -113,29 +104,27 @@ impl Reproduction<'_> {
         Ok(kept.result)
     }
 
-    /// The result of a step with a section of its own. Adds the claims of the step to `claims`.
+    /// The result of a step: the kept one if it has the same inputs, else that of `section`, which
+    /// is then kept.
     pub(super) fn step<R: Serialize>(
         &self,
         name: &str,
         inputs: Value,
-        claims: &mut Vec<Claim>,
-        run: impl FnOnce(&mut Vec<Claim>) -> Result<Found<R>, Error>,
+        section: fn(&Self) -> Result<Found<R>, Error>,
     ) -> Result<Found<Value>, Error> {
-        let step = self.kept(name, inputs, || {
-            let mut own = Vec::new();
-            let Found { section, record } = run(&mut own)?;
-            let record = serde_json::to_value(record)
-                .map_err(|problem| Error::Journal(format!("part '{name}': {problem}")))?;
-            Ok(Step {
+        self.kept(name, inputs, || {
+            let Found {
                 section,
                 record,
-                claims: own,
+                claims,
+            } = section(self)?;
+            let record = serde_json::to_value(record)
+                .map_err(|problem| Error::Journal(format!("part '{name}': {problem}")))?;
+            Ok(Found {
+                section,
+                record,
+                claims,
             })
-        })?;
-        claims.extend(step.claims);
-        Ok(Found {
-            section: step.section,
-            record: step.record,
         })
     }
 

@@ -1,8 +1,9 @@
 //! Reproduces the paper's tables and figures on given rooms, as one report.
 //!
 //! Start reading at [`reproduce`]. Every experiment produces one section of the report and one
-//! entry of the record. [`Notes`] collects the claims and adapters of all sections.
+//! entry of the record. [`Adapters`] collects the adapters of all sections.
 
+mod adapters;
 mod better;
 mod claims;
 mod cross;
@@ -10,7 +11,6 @@ mod formulations;
 mod journal;
 mod layers;
 mod navigation;
-mod notes;
 mod paper;
 mod pictures;
 mod plans;
@@ -20,14 +20,14 @@ mod strides;
 mod success;
 mod walks;
 
+pub use adapters::{Adapters, ReproducedAdapter, published_name};
 pub use claims::{Claim, Verdict};
 pub use journal::{Journal, NoJournal};
 pub use layers::LayerSet;
-pub use notes::{Notes, ReproducedAdapter, published_name};
 
 use std::collections::BTreeSet;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use seese3_core::adapter::Preset;
@@ -50,10 +50,10 @@ pub struct Options {
     pub strides: Vec<u32>,
     /// Numbers of training rooms along the scaling curve.
     pub sizes: Vec<usize>,
-    /// Number of trainings of every size, with seeds from 0.
+    /// Number of seeds, from 0, of every adapter that is trained on several rooms; the seed also
+    /// chooses its rooms.
     pub trainings: u64,
     /// Number of training rooms that plans with calibration use for calibration instead.
-    #[serde(rename = "aside")]
     pub calibration_rooms: usize,
     /// Number of seeds, from 0, in tables that average over seeds.
     pub seeds: u64,
@@ -145,10 +145,39 @@ struct ProtocolRecord {
 /// Number of experiments run by [`reproduce`].
 pub const EXPERIMENTS: u64 = 12;
 
-/// The result of an experiment: a section of the report, and its JSON record.
+/// The result of an experiment: a section of the report, its claims, and its JSON record.
+#[derive(Serialize, Deserialize)]
 struct Found<R> {
     section: Section,
     record: R,
+    claims: Vec<Claim>,
+}
+
+impl<R> Found<R> {
+    /// A result without claims.
+    fn new(section: Section, record: R) -> Self {
+        Self {
+            section,
+            record,
+            claims: Vec::new(),
+        }
+    }
+}
+
+/// The sections and claims of a report, in order.
+#[derive(Default)]
+struct Collected {
+    sections: Vec<Section>,
+    claims: Vec<Claim>,
+}
+
+impl Collected {
+    /// Adds the section and the claims of a result, and returns its record.
+    fn add<R>(&mut self, found: Found<R>) -> R {
+        self.sections.push(found.section);
+        self.claims.extend(found.claims);
+        found.record
+    }
 }
 
 /// Checks options and rooms before hours of training.
@@ -165,7 +194,7 @@ pub fn check(given: &Reproduction<'_>) -> Result<(), Error> {
         };
         if let Some(data) = set.train.iter().find(is_held_out) {
             return Err(Error::Input(format!(
-                "room '{}' is both learned from and held out",
+                "room '{}' is in both --train and --test",
                 data.room.id()
             )));
         }
@@ -184,9 +213,9 @@ pub fn check(given: &Reproduction<'_>) -> Result<(), Error> {
             stride, strides, ..
         } = &given.options;
         let all_strides = [&strides[..], &[*stride]].concat();
-        has_pairs(&set.in_room, "--in-room", &Split::FOLDS, &all_strides)?;
-        has_pairs(&set.in_room, "--in-room", &[Split::Blocks], &[*stride])?;
-        has_pairs(&set.test, "--test", &Split::FOLDS, &[*stride])?;
+        check_pairs(&set.in_room, "--in-room", &Split::FOLDS, &all_strides)?;
+        check_pairs(&set.in_room, "--in-room", &[Split::Blocks], &[*stride])?;
+        check_pairs(&set.test, "--test", &Split::FOLDS, &[*stride])?;
     }
     let rooms = given.sets.first().map_or(0, |set| set.train.len());
     let is_out_of_range = |size: &&usize| **size == 0 || **size > rooms;
@@ -197,17 +226,28 @@ pub fn check(given: &Reproduction<'_>) -> Result<(), Error> {
     }
 
     let calibration_rooms = given.options.calibration_rooms;
-    if calibration_rooms >= rooms {
+    if calibration_rooms == 0 || calibration_rooms >= rooms {
         return Err(Error::Input(format!(
-            "--calibration-rooms must leave rooms to train on: {calibration_rooms} of {rooms} were set aside"
+            "--calibration-rooms: {calibration_rooms} must be at least 1 and less than {rooms}, the number of training rooms"
         )));
+    }
+    let Options {
+        trainings,
+        seeds,
+        formulation_seeds,
+        ..
+    } = given.options;
+    if [trainings, seeds, formulation_seeds].contains(&0) {
+        return Err(Error::Input(
+            "--trainings, --seeds and --formulation-seeds must be at least 1".to_owned(),
+        ));
     }
 
     Ok(())
 }
 
 /// Checks that every recording has training and test pairs under every split, at each stride.
-fn has_pairs(
+fn check_pairs(
     rooms: &[RoomData<'_>],
     option: &str,
     splits: &[Split],
@@ -245,8 +285,8 @@ pub fn adapter_names(given: &Reproduction<'_>) -> Vec<String> {
 
 /// Runs the paper's experiments. `begin` is called with the name of each before it.
 ///
-/// What the journal of `given` has with the same inputs is not run again: the steps that use no
-/// adapter of another step, and the trained adapters.
+/// Trained adapters, and steps that use no other step's adapter, are taken from the journal of
+/// `given` if their inputs are unchanged.
 ///
 /// # Errors
 /// The [`Error`] of [`check`] or of the first failed experiment; [`Error::Journal`] if the journal
@@ -257,77 +297,84 @@ pub fn reproduce(
 ) -> Result<Reproduced, Error> {
     check(given)?;
 
-    let mut notes = Notes::default();
-    let within = within_rooms(given, begin, &mut notes.claims)?;
+    let steps = Steps { given, begin };
+    let within = within_rooms(&steps)?;
+    let mut adapters = Adapters::default();
     begin("navigation");
-    let navigation = navigation::section(given, &mut notes)?;
+    let navigation = navigation::section(given, &mut adapters)?;
 
     // Adapters trained on several rooms, evaluated in held-out rooms.
     begin("cross-room");
-    let across = plans::evaluate(given, &mut notes)?;
-    let cross_room = cross::section(given, &across, &mut notes.claims)?;
+    let across = plans::evaluate(given, &mut adapters)?;
+    let cross_room = cross::section(given, &across)?;
     begin("better");
-    let better = better::section(&across, &mut notes.claims);
+    let better = better::section(&across);
 
     // The walks use the steady adapters trained for the previous sections.
     begin("walks");
-    let mut claims = Vec::new();
-    let walks = walks::section(given, &notes, &mut claims)?;
-    notes.claims.extend(claims);
+    let walks = walks::section(given, &adapters)?;
     begin("pictures");
-    let pictures = pictures::section(given, &notes)?;
-    begin("theory");
-    let inputs = given.inputs(Value::Null, &[]);
-    let theory = given.step("theory", inputs, &mut notes.claims, |_| theory())?;
+    let pictures = pictures::section(given, &adapters)?;
+    let theory = steps.run("theory", Value::Null, &[], theory)?;
 
-    // The tests are complete only now.
-    claims::judge(&mut notes.claims);
-    // The verdicts are complete only now; place them near the top of the report, after the rooms.
-    let mut sections = vec![rooms_and_features(given), claims::section(&notes.claims)];
-    sections.extend([
-        within.probes.section,
-        within.strides.section,
-        within.layers.section,
-        within.rooms_alone.section,
-        within.settings.section,
-        within.formulations.section,
-        navigation.section,
-        cross_room.section,
-        better.section,
-        walks.section,
-        pictures.section,
-        theory.section,
-        published(&notes),
-    ]);
-
-    let record = ReproductionRecord {
-        probes: within.probes.record,
-        strides: within.strides.record,
-        layers: within.layers.record,
-        rooms_alone: within.rooms_alone.record,
-        settings: within.settings.record,
-        formulations: within.formulations.record,
-        navigation: navigation.record,
-        cross_room: cross_room.record,
-        better: better.record,
-        walks: walks.record,
-        pictures: pictures.record,
-        theory: theory.record,
-        claims: notes.claims,
+    let mut report = Collected::default();
+    report.sections.push(rooms_and_features(given));
+    let mut record = ReproductionRecord {
+        probes: report.add(within.probes),
+        strides: report.add(within.strides),
+        layers: report.add(within.layers),
+        rooms_alone: report.add(within.rooms_alone),
+        settings: report.add(within.settings),
+        formulations: report.add(within.formulations),
+        navigation: report.add(navigation),
+        cross_room: report.add(cross_room),
+        better: report.add(better),
+        walks: report.add(walks),
+        pictures: report.add(pictures),
+        theory: report.add(theory),
+        claims: Vec::new(),
         protocol: protocol(given),
     };
+    report.sections.push(published(&adapters));
+
+    // All tests exist now. The verdicts follow the list of rooms.
+    claims::judge(&mut report.claims);
+    report.sections.insert(1, claims::section(&report.claims));
+    record.claims = report.claims;
 
     Ok(Reproduced {
         document: Document {
             title: "SeeSE3 reproduced".to_owned(),
-            sections,
+            sections: report.sections,
         },
         record,
-        adapters: notes.adapters,
+        adapters: adapters.0,
     })
 }
 
-/// The steps within a room, which train adapters of their own alone.
+/// Runs the steps that the journal keeps.
+struct Steps<'a> {
+    given: &'a Reproduction<'a>,
+    begin: &'a dyn Fn(&'static str),
+}
+
+impl Steps<'_> {
+    /// The result of a step: the kept one if its options and rooms are unchanged, else that of
+    /// `section`.
+    fn run<R: Serialize>(
+        &self,
+        name: &'static str,
+        options: Value,
+        rooms: &[&[RoomData<'_>]],
+        section: fn(&Reproduction<'_>) -> Result<Found<R>, Error>,
+    ) -> Result<Found<Value>, Error> {
+        (self.begin)(name);
+        let inputs = self.given.inputs(options, rooms);
+        self.given.step(name, inputs, section)
+    }
+}
+
+/// Results of the steps within a room, which use no other step's adapter.
 struct WithinRooms {
     probes: Found<Value>,
     strides: Found<Value>,
@@ -337,11 +384,8 @@ struct WithinRooms {
     formulations: Found<Value>,
 }
 
-fn within_rooms(
-    given: &Reproduction<'_>,
-    begin: &dyn Fn(&'static str),
-    claims: &mut Vec<Claim>,
-) -> Result<WithinRooms, Error> {
+fn within_rooms(steps: &Steps<'_>) -> Result<WithinRooms, Error> {
+    let given = steps.given;
     let Options {
         stride,
         strides,
@@ -353,47 +397,25 @@ fn within_rooms(
     let alone: Vec<&[RoomData<'_>]> = given.sets.iter().map(|set| &*set.in_room).collect();
     let held_out: Vec<&[RoomData<'_>]> = given.sets.iter().map(|set| &*set.test).collect();
     let all = [&alone[..], &held_out[..]].concat();
-    let layers: Vec<&[RoomData<'_>]> = given.layers.iter().map(|layer| &*layer.rooms).collect();
+    let of_layers: Vec<&[RoomData<'_>]> = given.layers.iter().map(|layer| &*layer.rooms).collect();
 
-    begin("probes");
-    let inputs = given.inputs(json!({ "stride": stride }), &all);
-    let probes = given.step("probes", inputs, claims, |claims| {
-        probes::section(given, claims)
-    })?;
-    begin("strides");
-    let inputs = given.inputs(json!({ "strides": strides, "seeds": seeds }), &alone);
-    let strides_found = given.step("strides", inputs, claims, |claims| {
-        strides::section(given, claims)
-    })?;
-    begin("layers");
-    let inputs = given.inputs(json!({ "stride": stride, "seeds": seeds }), &layers);
-    let layers = given.step("layers", inputs, claims, |_| layers::section(given))?;
-    begin("rooms-alone");
-    let inputs = given.inputs(json!({ "strides": strides, "seeds": seeds }), &all);
-    let rooms_alone = given.step("rooms-alone", inputs, claims, |claims| {
-        success::section(given, claims)
-    })?;
-    begin("settings");
-    let inputs = given.inputs(json!({ "stride": stride, "seeds": seeds }), &alone);
-    let settings = given.step("settings", inputs, claims, |claims| {
-        settings::section(given, claims)
-    })?;
-    begin("formulations");
-    let inputs = given.inputs(
-        json!({ "stride": stride, "seeds": formulation_seeds, "epochs": formulation_epochs }),
-        &alone,
-    );
-    let formulations = given.step("formulations", inputs, claims, |claims| {
-        formulations::section(given, claims)
-    })?;
+    let at_stride = json!({ "stride": stride, "seeds": seeds });
+    let at_strides = json!({ "strides": strides, "seeds": seeds });
+    let of_formulations =
+        json!({ "stride": stride, "seeds": formulation_seeds, "epochs": formulation_epochs });
 
     Ok(WithinRooms {
-        probes,
-        strides: strides_found,
-        layers,
-        rooms_alone,
-        settings,
-        formulations,
+        probes: steps.run("probes", json!({ "stride": stride }), &all, probes::section)?,
+        strides: steps.run("strides", at_strides.clone(), &alone, strides::section)?,
+        layers: steps.run("layers", at_stride.clone(), &of_layers, layers::section)?,
+        rooms_alone: steps.run("rooms-alone", at_strides, &all, success::section)?,
+        settings: steps.run("settings", at_stride, &alone, settings::section)?,
+        formulations: steps.run(
+            "formulations",
+            of_formulations,
+            &alone,
+            formulations::section,
+        )?,
     })
 }
 
@@ -451,10 +473,7 @@ fn rooms_and_features(given: &Reproduction<'_>) -> Section {
     section.table(room_table(&given.sets[0]));
     section.table(feature_table(&given.sets));
 
-    section.text(
-        "The paper's numbers stand beside these as context: encoders, rooms and sizes differ, and nothing here speaks of \
-         models that were not run.",
-    );
+    section.text("The paper's numbers are context only: its encoders, rooms and sizes differ.");
 
     // Mark a trial run, so that it is not mistaken for a result.
     if let Some(epochs) = given.options.epochs {
@@ -470,9 +489,9 @@ fn rooms_and_features(given: &Reproduction<'_>) -> Section {
 fn room_table(set: &FeatureSet<'_>) -> Table {
     let mut table = Table::new("rooms | count | frames | recorded as");
     for (what, rooms) in [
-        ("learned together", &set.train),
-        ("held out", &set.test),
-        ("learned alone", &set.in_room),
+        ("training", &set.train),
+        ("held-out", &set.test),
+        ("in-room", &set.in_room),
     ] {
         let frames: usize = rooms.iter().map(|data| data.room.frame_count()).sum();
         let formats: BTreeSet<&str> = rooms
@@ -511,24 +530,21 @@ fn feature_table(sets: &[FeatureSet<'_>]) -> Table {
 }
 
 /// The section about the names of the published adapters.
-fn published(notes: &Notes) -> Section {
+fn published(adapters: &Adapters) -> Section {
     let mut section = Section::new("Adapters");
     section.text(format!(
         "The {} adapters of the tables of navigation are in the store, named \"reproduced.\" and what they learned from: \
          evaluate, navigate and serve take them. The record has their revisions, seeds and protocols; the other tables' \
          adapters are what `seese3 train` gives for the same room, preset and seed.",
-        notes.adapters.len()
+        adapters.0.len()
     ));
 
     section
 }
 
-fn theory() -> Result<Found<TheoryJson>, Error> {
+fn theory(_: &Reproduction<'_>) -> Result<Found<TheoryJson>, Error> {
     let found = checks(Effort::default(), &mut |_| ())?;
     let mut section = Section::new("Theorems, measured against their bounds");
     section.table(theory_table(&found));
-    Ok(Found {
-        section,
-        record: theory_json(&found),
-    })
+    Ok(Found::new(section, theory_json(&found)))
 }

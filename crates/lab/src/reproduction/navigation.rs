@@ -14,8 +14,8 @@ use seese3_core::splits::Split;
 use seese3_core::statistics::mean_of_known;
 use seese3_core::training::{RoomData, train_adapter};
 
-use super::claims::{Case, Claim, without_control};
-use super::notes::{Notes, ReproducedAdapter};
+use super::adapters::{Adapters, ReproducedAdapter};
+use super::claims::{Case, Claim, encoders_and_control};
 use super::{Error, Found, Reproduction, paper};
 use crate::report::{Figure, Section, Series, Table, fixed};
 
@@ -41,7 +41,7 @@ pub struct NavigationRecord {
 /// Builds the section with the navigation table.
 pub fn section(
     given: &Reproduction<'_>,
-    notes: &mut Notes,
+    adapters: &mut Adapters,
 ) -> Result<Found<Vec<NavigationRecord>>, Error> {
     let mut section = Section::new("Latent navigation within a room");
     let mut record = Vec::new();
@@ -57,7 +57,7 @@ pub fn section(
         };
 
         // The adapters are published at the end of the run, under the names in every record row.
-        notes.adapters.extend(learned);
+        adapters.0.extend(learned);
 
         // All rooms share one protocol, so a row index identifies the same navigator in every room.
         let thresholds = &navigated.reports[0].protocol.thresholds;
@@ -73,27 +73,30 @@ pub fn section(
             format!("Hit@ε within a room, features {}", set.features),
         );
 
-        if position < without_control(&given.sets).len() {
+        if position < encoders_and_control(&given.sets).0.len() {
             over_correctors.extend(navigated.over_correctors());
         }
         record.extend(rows);
     }
 
     section.text(format!(
-        "Means over the rooms that are learned alone: stride {}, last fifth of each recording, candidates are its \
+        "Means over the in-room rooms: stride {}, last fifth of each recording, candidates are its \
          frames, source included, one seed; adapters and correctors of {} epochs on all pairs at the \
          stride. 'in-sample' is fitted on the scored pairs: a leak, and the likely protocol of the paper's refit.",
         given.options.stride,
         given.options.epochs.unwrap_or(NAVIGATION_EPOCHS)
     ));
 
-    notes.claims.push(Claim::new(
-        "inverse Poincaré hits more often than every learned corrector (Hit@0.1)",
+    let claim = Claim::new(
+        "affine inverse Poincaré hits more often than every learned corrector (Hit@0.1)",
         "Hit@0.1 of inverse Poincaré minus that of the corrector",
         over_correctors,
-    ));
-
-    Ok(Found { section, record })
+    );
+    Ok(Found {
+        section,
+        record,
+        claims: vec![claim],
+    })
 }
 
 /// One row per navigator, then the paper's rows, which have the same columns.

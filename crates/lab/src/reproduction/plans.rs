@@ -13,18 +13,18 @@ use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan};
 
-use super::notes::{Notes, ReproducedAdapter};
+use super::adapters::{Adapters, ReproducedAdapter};
 use super::{Error, FeatureSet, Reproduction};
 use crate::experiments::cross_room::{
-    CrossRoomPlan, CrossRoomProgress, CrossRoomRun, nested_choice, test_trained,
-    train_and_calibrate,
+    CrossRoomPlan, CrossRoomProgress, CrossRoomRun, RoomOutcome, Skipped, nested_choice,
+    test_trained, train_and_calibrate,
 };
 
 /// Number of adapters in an ensemble.
 pub const MEMBERS: usize = 4;
 
 /// An upper bound on the length of plan names, for checking names before training.
-pub const LONGEST_NAME: &str = "paper-range-aside-of-100000";
+pub const LONGEST_NAME: &str = "paper-range-calibrated-of-100000";
 
 /// The kinds of adapters in the cross-room sections, in the order of their table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -46,10 +46,10 @@ impl PlanKind {
     pub fn name(self) -> &'static str {
         match self {
             Self::PaperRange => "paper-range",
-            Self::PaperRangeCalibrated => "paper-range, errors measured aside",
-            Self::EnsembleCalibrated => "ensemble of paper-range, errors measured aside",
+            Self::PaperRangeCalibrated => "paper-range, calibrated",
+            Self::EnsembleCalibrated => "ensemble of paper-range, calibrated",
             Self::Steady => "steady",
-            Self::SteadyCalibrated => "steady, errors measured aside",
+            Self::SteadyCalibrated => "steady, calibrated",
         }
     }
 
@@ -57,10 +57,10 @@ impl PlanKind {
     fn short_name(self) -> &'static str {
         match self {
             Self::PaperRange => "paper-range",
-            Self::PaperRangeCalibrated => "paper-range-aside",
-            Self::EnsembleCalibrated => "ensemble-aside",
+            Self::PaperRangeCalibrated => "paper-range-calibrated",
+            Self::EnsembleCalibrated => "ensemble-calibrated",
             Self::Steady => "steady",
-            Self::SteadyCalibrated => "steady-aside",
+            Self::SteadyCalibrated => "steady-calibrated",
         }
     }
 
@@ -137,6 +137,8 @@ pub struct SetResults {
     pub on_all_rooms: Vec<KindResults>,
     /// Results of the paper's preset, by increasing number of rooms.
     pub by_size: Vec<SizeResults>,
+    /// Held-out rooms that some adapter could not be evaluated in. No run has results of them.
+    pub skipped: Vec<Skipped>,
     /// Results of the paper's preset on all rooms, in the second visits of the held-out rooms that
     /// have several; refits there are fitted on the first visit.
     pub second_visits: CrossRoomRun,
@@ -165,23 +167,27 @@ pub fn steady_adapter(set: &FeatureSet<'_>) -> String {
 }
 
 /// Trains the adapters of every plan and feature set, and evaluates them in the held-out rooms.
-pub fn evaluate(given: &Reproduction<'_>, notes: &mut Notes) -> Result<Vec<SetResults>, Error> {
+pub fn evaluate(
+    given: &Reproduction<'_>,
+    adapters: &mut Adapters,
+) -> Result<Vec<SetResults>, Error> {
     given
         .sets
         .iter()
-        .map(|set| evaluate_set(given, set, notes))
+        .map(|set| evaluate_set(given, set, adapters))
         .collect()
 }
 
 fn evaluate_set(
     given: &Reproduction<'_>,
     set: &FeatureSet<'_>,
-    notes: &mut Notes,
+    adapters: &mut Adapters,
 ) -> Result<SetResults, Error> {
-    let results: Vec<(PlanResult, ReproducedAdapter)> = plans(given, set)
+    let mut results: Vec<(PlanResult, ReproducedAdapter)> = plans(given, set)
         .into_par_iter()
         .map(|plan| result_of(given, set, plan))
         .collect::<Result<_, Error>>()?;
+    let skipped = skip_in_all(results.iter_mut().map(|(result, _)| &mut result.run));
 
     let is_baseline = |plan: &AdapterPlan| {
         plan.kind == PlanKind::PaperRange && plan.rooms == set.train.len() && plan.seed == 0
@@ -197,7 +203,7 @@ fn evaluate_set(
     for (PlanResult { plan, run }, adapter) in results {
         // The other seeds show the spread of a training; their adapters are not published.
         if plan.seed == 0 {
-            notes.adapters.push(adapter);
+            adapters.0.push(adapter);
         }
         if plan.rooms == set.train.len() {
             by_kind.entry(plan.kind).or_default().push(run.clone());
@@ -227,8 +233,30 @@ fn evaluate_set(
                 runs: by_seed(runs),
             })
             .collect(),
+        skipped,
         second_visits,
     })
+}
+
+/// Removes the rooms that one run skipped from all runs, so that runs can be paired room by room.
+/// Returns these rooms, each once.
+fn skip_in_all<'a>(runs: impl Iterator<Item = &'a mut CrossRoomRun>) -> Vec<Skipped> {
+    let runs: Vec<&mut CrossRoomRun> = runs.collect();
+    let mut skipped: Vec<Skipped> = Vec::new();
+    for room in runs.iter().flat_map(|run| &run.skipped) {
+        if skipped.iter().all(|other| other.room != room.room) {
+            skipped.push(room.clone());
+        }
+    }
+
+    for run in runs {
+        let is_kept = |outcome: &RoomOutcome| {
+            let room = outcome.room.as_str();
+            skipped.iter().all(|other| other.room.as_str() != room)
+        };
+        run.outcomes.retain(is_kept);
+    }
+    skipped
 }
 
 /// All plans, longest training first, so that no long training runs alone at the end.
@@ -379,7 +407,7 @@ fn training_plan(given: &Reproduction<'_>, of: AdapterPlan) -> TrainingPlan {
 }
 
 /// The navigators of the cross-room tables. Calibrated retrieval needs the error covariance from
-/// calibration rooms. Only seed 0 has the rows that no other training is compared with.
+/// calibration rooms. Refits and the other metrics are evaluated for seed 0 only.
 fn navigators(plan: &AdapterPlan) -> Vec<NavigatorKind> {
     let affine = StepKind::InversePoincare(Reading::Affine);
     let homogeneous = StepKind::InversePoincare(Reading::Homogeneous);

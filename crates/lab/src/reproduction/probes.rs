@@ -7,7 +7,7 @@ use seese3_core::splits::Split;
 use seese3_core::statistics::mean_of_known;
 use seese3_core::training::RoomData;
 
-use super::claims::{Case, Claim};
+use super::claims::{Case, Claim, encoders_and_control};
 use super::{Error, Found, Reproduction, paper};
 use crate::experiments::Within;
 use crate::experiments::cross_room::clipped_r2;
@@ -15,8 +15,6 @@ use crate::experiments::folds::FoldedMotions;
 use crate::probes::{MutualKnn, PoseDistance, intrinsic_dimension, mutual_knn, ridge_probe};
 use crate::report::{Axes, Figure, Section, Series, Table, fixed};
 
-/// Maximum number of frames that M1 compares, as in the paper.
-const M1_FRAMES: usize = 256;
 /// An M3 R² up to this one is "near zero": the paper's largest is 0.09 (V-JEPA 2.1).
 const LARGEST_LINEAR_R2: f64 = 0.1;
 
@@ -52,10 +50,7 @@ impl ProbeRecord {
 }
 
 /// Builds the section with M1 at a short and a long stride, M2 and M3.
-pub fn section(
-    given: &Reproduction<'_>,
-    claims: &mut Vec<Claim>,
-) -> Result<Found<Vec<ProbeRecord>>, Error> {
+pub fn section(given: &Reproduction<'_>) -> Result<Found<Vec<ProbeRecord>>, Error> {
     // Probes use no other rooms, so the held-out rooms are probed too. They train no adapter, so a
     // room has one value per probe and no spread over seeds.
     let mut by_set: Vec<Vec<ProbeRecord>> = Vec::new();
@@ -70,9 +65,10 @@ pub fn section(
     let mut section = Section::new("Probes: M1, M2, M3");
     section.table(table(given, &by_set));
     section.text(format!(
-        "M1: {M1_FRAMES} frames, k 10, 10 of them to each side left out; short is stride 1, long spreads them over the \
-         whole recording. M2: no gap, as in the paper. M3 and always answering the mean training motion: stride {}, the \
-         pairs of all five folds together.",
+        "M1: at most {} frames, k 10, 10 of them to each side left out; short is the first frames, long is the smallest \
+         stride at which they span the recording. M2: no gap, as in the paper. M3 and always answering the mean training \
+         motion: stride {}, the pairs of all five folds together.",
+        MutualKnn::default().frames,
         given.options.stride
     ));
 
@@ -96,9 +92,12 @@ pub fn section(
         "M1 at a short and a long stride, a point a room; the line is y = x",
     );
 
-    claims.extend(claims_of(given, &by_set));
-    let record = by_set.into_iter().flatten().collect();
-    Ok(Found { section, record })
+    let claims = claims_of(given, &by_set);
+    Ok(Found {
+        section,
+        record: by_set.into_iter().flatten().collect(),
+        claims,
+    })
 }
 
 /// One row per single-adapter room, and one for the held-out rooms together; the paper's rows
@@ -143,9 +142,7 @@ fn table(given: &Reproduction<'_>, by_set: &[Vec<ProbeRecord>]) -> Table {
 /// The claims on M1 to M3 of the trained encoders. By convention the last feature set is the
 /// control, which needs no trained encoder.
 fn claims_of(given: &Reproduction<'_>, by_set: &[Vec<ProbeRecord>]) -> Vec<Claim> {
-    let Some((control, trained)) = by_set.split_last() else {
-        return Vec::new();
-    };
+    let (trained, control) = encoders_and_control(by_set);
     let encoders = || {
         let names = given.sets.iter().map(|set| set.features.as_str());
         names.zip(trained)
@@ -155,8 +152,9 @@ fn claims_of(given: &Reproduction<'_>, by_set: &[Vec<ProbeRecord>]) -> Vec<Claim
     };
     let long = |set: &[ProbeRecord]| of(set, |room| room.m1_long);
 
-    let topology =
-        encoders().map(|(name, set)| Case::of_difference(name, &long(set), &long(control)));
+    let topology = control.into_iter().flat_map(|control| {
+        encoders().map(|(name, set)| Case::of_difference(name, &long(set), &long(control)))
+    });
     let dimension = encoders().flat_map(|(name, set)| {
         let two_nn = margin_around_six(&of(set, |room| room.twonn));
         let mle = margin_around_six(&of(set, |room| room.mle));
@@ -182,7 +180,7 @@ fn claims_of(given: &Reproduction<'_>, by_set: &[Vec<ProbeRecord>]) -> Vec<Claim
             dimension.collect(),
         ),
         Claim::new(
-            "no feature is linear in motion by itself: ridge regression has an R² near 0 or below (M3)",
+            "no feature is linear in motion by itself: ridge regression has an R² of at most 0.1 (M3)",
             "0.1, about the paper's largest R², minus max(R², −1)",
             linear.collect(),
         ),
@@ -211,19 +209,16 @@ fn probed(
         )
     };
 
-    // The long stride spreads the sampled frames over the whole recording.
-    let frames = M1_FRAMES.min(room.frame_count());
-    let long = (room.frame_count().saturating_sub(1) / frames.saturating_sub(1).max(1)).max(1);
-
-    let at = |stride: usize, pose_distance: PoseDistance| {
-        let options = MutualKnn {
-            frames,
-            stride,
-            pose_distance,
-            ..MutualKnn::default()
-        };
-        mutual_knn(rows, room.poses(), &options).within(what)
+    let short = MutualKnn {
+        frames: MutualKnn::default().frames.min(room.frame_count()),
+        ..MutualKnn::default()
     };
+    let long = MutualKnn::spanning(room.frame_count());
+    let by_twist = MutualKnn {
+        pose_distance: PoseDistance::Twist,
+        ..long
+    };
+    let m1 = |options: &MutualKnn| mutual_knn(rows, room.poses(), options).within(what);
 
     // M2 without a temporal gap, as in the paper; `sweep layers` uses a gap by default.
     let dimension = intrinsic_dimension(rows, 0).within(what)?;
@@ -235,9 +230,9 @@ fn probed(
     Ok(ProbeRecord {
         features: features.to_owned(),
         room: room.id().to_string(),
-        m1_short: at(1, PoseDistance::NineNumbers)?,
-        m1_long: at(long, PoseDistance::NineNumbers)?,
-        m1_long_twist: at(long, PoseDistance::Twist)?,
+        m1_short: m1(&short)?,
+        m1_long: m1(&long)?,
+        m1_long_twist: m1(&by_twist)?,
         twonn: dimension.two_nn.linear,
         mle: dimension.mle_biased.harmonic,
         m3: ridge.scores().overall,

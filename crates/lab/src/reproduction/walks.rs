@@ -12,9 +12,9 @@ use seese3_core::splits::Split;
 use seese3_core::statistics::{mean, mean_of_known, median};
 use seese3_core::training::RoomData;
 
-use super::claims::{Case, Claim, without_control};
+use super::adapters::Adapters;
+use super::claims::{Case, Claim, encoders_and_control};
 use super::cross::HOMOGENEOUS;
-use super::notes::Notes;
 use super::plans::steady_adapter;
 use super::{Error, Found, Reproduction};
 use crate::experiments::cross_room::{RoomOutcome, outcomes};
@@ -68,13 +68,12 @@ struct Walks {
 /// Builds the section with the ends of walks in all held-out rooms.
 pub fn section(
     given: &Reproduction<'_>,
-    notes: &Notes,
-    claims: &mut Vec<Claim>,
+    adapters: &Adapters,
 ) -> Result<Found<Vec<WalkEndRecord>>, Error> {
     let mut walks = Vec::new();
     for set in &given.sets {
         for mode in MODES {
-            walks.push(walked(given, notes, &set.features, &set.test, mode)?);
+            walks.push(walked(given, adapters, &set.features, &set.test, mode)?);
         }
     }
 
@@ -96,36 +95,39 @@ pub fn section(
             format!("{:.2}", row.error / row.still_error)
         }),
     ];
-    let mut section =
-        Section::new("Walks of four steps in rooms never seen, by size of the motion");
+    let mut section = Section::new("Walks of four steps in held-out rooms, by size of the motion");
     section.table(Table::of(&record, &columns));
     section.text(format!(
-        "Adapters of preset steady on all rooms that are learned together. Every pair of every held-out room at strides {:?}, \
+        "Adapters of preset steady on all training rooms. Every pair of every held-out room at strides {:?}, \
          {STEPS} equal steps by {HOMOGENEOUS}, all frames are candidates. The size of a motion is ‖ΔP‖, the end error \
          ‖ΔP − ΔP of the last frame‖, meters and radians together; standing still has the size as its error. Means over \
          rooms; meters and degrees are medians. Open loop is the paper's mode and ends where one step ends (A-22); snap \
          takes each step from the frame that the last one retrieved.",
         given.options.strides
     ));
-    let encoders: Vec<&str> = without_control(&given.sets)
+    let encoders: Vec<&str> = encoders_and_control(&given.sets)
+        .0
         .iter()
         .map(|set| set.features.as_str())
         .collect();
     walks.retain(|walks| encoders.contains(&walks.features.as_str()));
-    claims.extend(claims_of(&walks));
-    Ok(Found { section, record })
+    Ok(Found {
+        section,
+        record,
+        claims: claims_of(&walks).into(),
+    })
 }
 
 fn walked(
     given: &Reproduction<'_>,
-    notes: &Notes,
+    adapters: &Adapters,
     features: &str,
     rooms: &[RoomData<'_>],
     mode: Mode,
 ) -> Result<Walks, Error> {
     let set = given.sets.iter().find(|set| set.features == features);
     let plan = set.map(steady_adapter).unwrap_or_default();
-    let trained = notes
+    let trained = adapters
         .reproduced(&plan, features)
         .ok_or_else(|| Error::Input("the steady adapter was not trained".to_owned()))?;
     let adapter = Arc::new(trained.adapter.clone());
@@ -266,7 +268,7 @@ fn claims_of(walks: &[Walks]) -> [Claim; 2] {
 
     [
         Claim::new(
-            "a walk of four steps in an open loop ends nearer to its target than it began, in rooms never seen",
+            "a walk of four steps in an open loop ends nearer to its target than it began, in held-out rooms",
             "‖ΔP‖ minus the end error",
             nearer,
         ),

@@ -11,7 +11,7 @@ use strum::VariantArray;
 
 use seese3_core::training::RoomData;
 
-use super::notes::Notes;
+use super::adapters::Adapters;
 use super::plans::steady_adapter;
 use super::{Error, Found, Reproduction};
 use crate::report::Section;
@@ -19,17 +19,18 @@ use walks::Length;
 pub use walks::WalkRecord;
 
 /// Builds the section with walks in rooms with images, and with the paths of features and latents.
-pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found<Vec<WalkRecord>>, Error> {
-    let mut section = Section::new("Walks in rooms never seen, and a recording unrolled");
+pub fn section(
+    given: &Reproduction<'_>,
+    adapters: &Adapters,
+) -> Result<Found<Vec<WalkRecord>>, Error> {
+    let mut section = Section::new("Walks in held-out rooms, and a recording unrolled");
     // Pictures use only the first feature set.
     let set = &given.sets[0];
-    let adapter = notes
+    let adapter = adapters
         .reproduced(&steady_adapter(set), &set.features)
         .ok_or_else(|| Error::Input("the steady adapter was not trained".to_owned()))?;
     let adapter = Arc::new(adapter.adapter.clone());
-    section.text(
-        "Adapter of preset steady, learned from all rooms that are learned together; it saw no frame of the rooms shown.",
-    );
+    section.text("Adapter of preset steady on all training rooms; none of them is shown.");
 
     let is_drawn = |data: &&RoomData<'_>| data.room.provenance().format.starts_with("studio");
     let has_images = |data: &&RoomData<'_>| !data.room.images().is_empty();
@@ -80,8 +81,5 @@ pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found<Vec<Walk
     }
 
     unrolled::add(&mut section, &set.test[0], &adapter)?;
-    Ok(Found {
-        section,
-        record: walks,
-    })
+    Ok(Found::new(section, walks))
 }

@@ -1,23 +1,16 @@
-//! Claims and adapters that the sections collect for the end of the run.
+//! Adapters that the sections collect for the end of the run.
 
 use ndarray::Array2;
 
 use seese3_core::adapter::{Adapter, TrainingRecord};
 use seese3_core::training::RoomData;
 
-use super::Claim;
-
 /// Number of leading feature rows of a room kept for an adapter's golden inputs.
 const GOLDEN_ROWS: usize = 64;
 
-/// Claims and adapters collected while the sections run.
+/// Adapters to publish after the last section.
 #[derive(Default)]
-pub struct Notes {
-    /// Claims, in the order of the sections.
-    pub claims: Vec<Claim>,
-    /// Adapters to publish after the last section.
-    pub adapters: Vec<ReproducedAdapter>,
-}
+pub struct Adapters(pub Vec<ReproducedAdapter>);
 
 /// A trained adapter of a table row.
 pub struct ReproducedAdapter {
@@ -54,12 +47,10 @@ pub fn published_name(what: &str, features: &str) -> String {
     format!("reproduced.{what}.{features}")
 }
 
-impl Notes {
+impl Adapters {
     /// The adapter of `what` with these features, if this run trained it.
     pub fn reproduced(&self, what: &str, features: &str) -> Option<&ReproducedAdapter> {
         let name = published_name(what, features);
-        self.adapters
-            .iter()
-            .find(|reproduced| reproduced.name == name)
+        self.0.iter().find(|reproduced| reproduced.name == name)
     }
 }
