@@ -9,15 +9,18 @@ use clap::{Args, Subcommand};
 
 use super::evaluate::navigators_named;
 use super::named::one_of;
-use super::output::{JsonOutput, begin_output, say, write_compact_json, write_file, write_json};
+use super::output::{
+    JsonOutput, begin_input, begin_output, say, write_compact_json, write_file, write_json,
+};
 use super::progress::bar;
 use super::rooms::{data, room_names};
-use crate::table_files::TableFiles;
+use crate::table_files::{TableFiles, markdown_file};
+use seese3_core::adapter::TrainingRecord;
 use seese3_core::cancel::Cancellation;
-use seese3_core::eval::{Protocol, evaluate};
-use seese3_core::features::FeatureSource;
+use seese3_core::eval::{Protocol, evaluate, has_seen};
 use seese3_core::geometry::Pose;
-use seese3_core::navigation::{IndexKind, Navigator};
+use seese3_core::navigation::{IndexKind, Navigator, NavigatorKind};
+use seese3_core::room::RoomId;
 use seese3_core::splits::{Pair, Split};
 use seese3_lab::benchmark::{
     Benchmark, BenchmarkScores, Described, Error, FeatureMetrics, MetricMeans, RoomMetrics,
@@ -121,7 +124,7 @@ struct Score {
     #[arg(long = "submission", value_name = "FILE", required = true)]
     submissions: Vec<PathBuf>,
     /// Also write a page of results to this Markdown file
-    #[arg(long, value_name = "FILE.md")]
+    #[arg(long, value_name = "FILE.md", value_parser = markdown_file)]
     page: Option<PathBuf>,
     #[command(flatten)]
     files: TableFiles,
@@ -160,7 +163,7 @@ struct Encoders {
     #[arg(long = "metrics", value_name = "FILE", required = true)]
     metrics: Vec<PathBuf>,
     /// Also write a page of the metrics to this Markdown file
-    #[arg(long, value_name = "FILE.md")]
+    #[arg(long, value_name = "FILE.md", value_parser = markdown_file)]
     page: Option<PathBuf>,
     #[command(flatten)]
     files: TableFiles,
@@ -213,8 +216,11 @@ impl Answer {
         let benchmark = read_benchmark(&self.benchmark)?;
         check_submission_text(&self.name, &self.about)?;
         let store = Store::open(&self.store)?;
-        let adapter = store.load_adapter(&self.adapter, None).await?.adapter;
-        let navigators = navigators_named(std::slice::from_ref(&self.navigator))?;
+        let navigators =
+            navigators_named(std::slice::from_ref(&self.navigator)).context("--navigator")?;
+        let stored = store.load_adapter(&self.adapter, None).await?;
+        check_held_out(&benchmark, &self.adapter, &stored.record, &self.navigator)?;
+        let adapter = stored.adapter;
         let protocol = Protocol {
             split: benchmark.split()?,
             navigators,
@@ -233,7 +239,8 @@ impl Answer {
                 &features,
                 adapter.clone(),
                 IndexKind::Exact,
-            )?;
+            )
+            .with_context(|| format!("room '{}'", frozen.room))?;
             let cancel = Cancellation::default();
             let report = evaluate(&navigator, &protocol, &cancel, &mut |_, _| ())?;
             let scored = &report.rows[0].retrieval.pairs;
@@ -255,6 +262,27 @@ impl Answer {
         say(format_args!("wrote {}", self.out.display()));
         Ok(())
     }
+}
+
+/// Refuses answers that use the targets, or frames of the benchmark in training.
+fn check_held_out(
+    benchmark: &Benchmark,
+    adapter: &str,
+    record: &TrainingRecord,
+    navigator: &str,
+) -> anyhow::Result<()> {
+    ensure!(
+        navigator != NavigatorKind::Oracle.name() && !navigator.contains("in-sample"),
+        "--navigator: '{navigator}' uses the targets of the test pairs"
+    );
+    for frozen in &benchmark.rooms {
+        let room = RoomId::new(&frozen.room)?;
+        ensure!(
+            !has_seen(record, &room),
+            "--adapter: '{adapter}' was trained or calibrated on room '{room}' of the benchmark"
+        );
+    }
+    Ok(())
 }
 
 impl Check {
@@ -331,32 +359,35 @@ impl ProbeFeatures {
         check_description(name, &self.about, None)?;
         let store = Store::open(&self.store)?;
 
-        // One room after the other; within a room, the seeds of M4 are trained in parallel.
-        let progress = bar(benchmark.rooms.len() as u64, "probing");
-        let mut source: Option<FeatureSource> = None;
-        let mut rooms = Vec::with_capacity(benchmark.rooms.len());
+        // Check all rooms before minutes of work.
+        let mut loaded = Vec::with_capacity(benchmark.rooms.len());
         for frozen in &benchmark.rooms {
-            let loaded = store
+            let room = store
                 .load_room_with(&frozen.room, Some(&self.features))
                 .await?;
-            frozen.check_poses(loaded.0.room.poses())?;
-            let made = loaded.1.source();
-            let first = source.get_or_insert_with(|| made.clone());
+            frozen.check_poses(room.0.room.poses())?;
+            loaded.push(room);
+        }
+        let source = loaded[0].1.source().clone();
+        for (frozen, (_, features)) in benchmark.rooms.iter().zip(&loaded) {
             ensure!(
-                first == made,
+                *features.source() == source,
                 "room '{}': its features '{}' were made in another way than those of room '{}'",
                 frozen.room,
                 self.features,
                 benchmark.rooms[0].room
             );
+        }
 
-            let measured = RoomMetrics::measure(&data(&loaded), benchmark.stride);
+        let progress = bar(benchmark.rooms.len() as u64, "probing");
+        let mut rooms = Vec::with_capacity(loaded.len());
+        for (frozen, loaded) in benchmark.rooms.iter().zip(&loaded) {
+            let measured = RoomMetrics::measure(&data(loaded), benchmark.stride);
             rooms.push(measured.with_context(|| format!("room '{}'", frozen.room))?);
             progress.inc(1);
         }
         progress.finish_and_clear();
 
-        let source = source.context("the benchmark has no rooms")?;
         let metrics = FeatureMetrics::new(
             &benchmark,
             Described {
@@ -421,6 +452,7 @@ fn read_submission(file: &Path, benchmark: &Benchmark) -> anyhow::Result<Submiss
 
 /// Reads a file, and then its content. Errors name the file.
 fn read<T>(file: &Path, content: impl FnOnce(&[u8]) -> Result<T, Error>) -> anyhow::Result<T> {
+    begin_input(file)?;
     let place = file.display();
     let bytes = seese3_files::read(file, MOST_BYTES);
     let bytes = bytes.with_context(|| format!("{place} cannot be read"))?;

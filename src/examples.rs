@@ -98,7 +98,7 @@ benchmark check
 benchmark score
   seese3 benchmark score --benchmark rooms-7.json --store suite --submission mine.json --submission other.json --page results.md
 benchmark probe
-  seese3 benchmark probe --benchmark rooms-7.json --store suite --features pixels --about 'Raw pixels.' --out pixels.json
+  seese3 benchmark probe --benchmark rooms-7.json --store suite --features pixels --about pixels --out pixels.json
 benchmark encoders
   seese3 benchmark encoders --benchmark rooms-7.json --metrics pixels.json --metrics mine.json --page encoders.md
 card

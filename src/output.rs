@@ -19,8 +19,8 @@ static IS_SILENT: AtomicBool = AtomicBool::new(false);
 /// The first error of a write to standard output.
 static PRINT_PROBLEM: OnceLock<String> = OnceLock::new();
 
-/// The outputs of this process.
-static OUTPUTS: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
+/// The registered files of this process.
+static FILES: Mutex<Vec<(PathBuf, Use)>> = Mutex::new(Vec::new());
 
 /// Place of `--json` in the help of a command: after the command's own options.
 pub const LAST_OPTION: usize = 900;
@@ -114,7 +114,7 @@ impl JsonLines {
 }
 
 fn is_standard_output(path: &Path) -> bool {
-    path.as_os_str() == STANDARD_OUTPUT
+    path.as_os_str() == STANDARD_OUTPUT || path == Path::new("/dev/stdout")
 }
 
 /// Turns text output off.
@@ -198,7 +198,8 @@ pub fn not_built(what: &str, feature: &str) -> anyhow::Error {
 /// output off.
 ///
 /// # Errors
-/// A folder, a file in a missing folder, and a second output to the same file.
+/// A folder, a file in a missing folder, a file of a store, an input of the command, and a second
+/// output to the same file.
 pub fn begin_output(path: &Path) -> anyhow::Result<()> {
     if is_standard_output(path) {
         silence();
@@ -207,15 +208,58 @@ pub fn begin_output(path: &Path) -> anyhow::Result<()> {
     }
     check_folder(path)?;
 
-    let mut outputs = OUTPUTS.lock().unwrap_or_else(PoisonError::into_inner);
     let place = absolute(path);
-    // Devices, for example /dev/null, take any number of outputs.
-    let is_device = std::fs::metadata(&place).is_ok_and(|found| !found.is_file());
-    if !is_device && outputs.contains(&place) {
-        anyhow::bail!("{}: two outputs cannot have the same file", path.display());
+    if place.ancestors().skip(1).any(is_resource_of_a_store) {
+        anyhow::bail!(
+            "{} is a file of a store; name a file elsewhere",
+            path.display()
+        );
     }
-    outputs.push(place);
+    register(path, place, Use::Output)
+}
+
+/// Registers a file that the command reads, so that no output replaces it.
+///
+/// # Errors
+/// The file is an output, too.
+#[cfg(feature = "lab")]
+pub fn begin_input(path: &Path) -> anyhow::Result<()> {
+    register(path, absolute(path), Use::Input)
+}
+
+/// What a command does with a file.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Use {
+    #[cfg(feature = "lab")]
+    Input,
+    Output,
+}
+
+fn register(path: &Path, place: PathBuf, this: Use) -> anyhow::Result<()> {
+    // Devices, for example /dev/null, take any number of outputs.
+    if std::fs::metadata(&place).is_ok_and(|found| !found.is_file()) {
+        return Ok(());
+    }
+
+    let mut files = FILES.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut earlier = files.iter().filter(|(other, _)| *other == place);
+    if let Some((_, other)) = earlier.find(|(_, other)| [*other, this].contains(&Use::Output)) {
+        let problem = match [*other, this] {
+            [Use::Output, Use::Output] => "two outputs cannot have the same file",
+            #[cfg(feature = "lab")]
+            _ => "an output would replace this input; name another file",
+        };
+        anyhow::bail!("{}: {problem}", path.display());
+    }
+    files.push((place, this));
     Ok(())
+}
+
+/// Whether a folder is that of a room or an adapter of a store.
+fn is_resource_of_a_store(folder: &Path) -> bool {
+    let kind = folder.parent().and_then(Path::file_name);
+    let is_kind = kind.is_some_and(|kind| kind == "rooms" || kind == "adapters");
+    is_kind && folder.join("revisions").is_dir()
 }
 
 /// The path with its folder made absolute, and without symbolic links.

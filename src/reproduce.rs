@@ -252,7 +252,14 @@ impl FolderJournal {
     /// Opens the journal in a folder, or begins one.
     fn open(folder: &Path) -> anyhow::Result<Self> {
         let adapters = folder.join("adapters");
-        if adapters.exists() {
+        let is_begun = std::fs::read_dir(adapters.join("adapters")).is_ok();
+        let has_parts = std::fs::read_dir(folder).is_ok_and(|mut entries| {
+            let is_part = |entry: std::io::Result<std::fs::DirEntry>| {
+                entry.is_ok_and(|entry| entry.path().extension().is_some_and(|name| name == "json"))
+            };
+            entries.any(is_part)
+        });
+        if is_begun || has_parts {
             say(format_args!(
                 "reusing finished parts of {}",
                 folder.display()

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::output::{begin_output, say, write_file};
+use super::output::{STANDARD_OUTPUT, begin_output, say, write_file};
 use seese3_lab::report::{Table, dot_plot};
 #[cfg(feature = "plots")]
 use seese3_lab::report::{plot_pdf, plot_png};
@@ -84,6 +84,14 @@ pub fn plot_file(given: &str) -> Result<PathBuf, String> {
         return Err("this build draws .svg only; .pdf and .png need the feature plots".into());
     }
     Ok(file)
+}
+
+/// Accepts a file name that ends with .md, and standard output.
+pub fn markdown_file(given: &str) -> Result<PathBuf, String> {
+    match given {
+        STANDARD_OUTPUT => Ok(PathBuf::from(given)),
+        _ => named(given, &["md"]),
+    }
 }
 
 /// Accepts a file name that ends with .csv, .tex or .md.

@@ -125,6 +125,10 @@ fn features_are_measured_as_probe_measures() {
         &format!("{compare} --metrics mine.json"),
         &["'mine' is in two files"],
     );
+    let m4 = format!("\"m4\": {}", ours["m4"]);
+    assert!(text.contains(&m4), "{text}");
+    std::fs::write(here.file("wrong.json"), text.replace(&m4, "\"m4\": 9.5")).unwrap();
+    here.refuses(compare_wrong, &["rooms.r.m4: must be an R² of at most 1"]);
 }
 
 /// Oracle: every output is whole JSON, or the command is refused.
@@ -144,4 +148,53 @@ fn outputs_do_not_mix() {
         &["both.md: two outputs cannot have the same file"],
     );
     assert!(!here.file("both.md").exists());
+
+    // Inputs, and files of the store, stay as they are.
+    here.succeeds(&format!("{freeze} small.json"));
+    let frozen = std::fs::read(here.file("small.json")).unwrap();
+    here.refuses(
+        "benchmark probe --benchmark small.json --store store --features fourier --about x --out ./small.json",
+        &["small.json", "would replace this input"],
+    );
+    assert_eq!(std::fs::read(here.file("small.json")).unwrap(), frozen);
+    here.refuses(
+        "card --store store --room r --features fourier --json store/rooms/r/revisions/000001.json",
+        &["is a file of a store"],
+    );
+}
+
+/// Oracle: the rules of docs/benchmark.md: every committed submission is valid and on the page of
+/// results, and the page of encoders is what the committed files give.
+#[test]
+fn the_benchmark_of_the_repository_is_whole() {
+    let here = Place::new();
+    let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/benchmark");
+    std::os::unix::fs::symlink(&folder, here.file("docs")).unwrap();
+    let files = |of: &str| -> Vec<String> {
+        let entries = std::fs::read_dir(folder.join(of)).unwrap();
+        let name = |entry: std::io::Result<std::fs::DirEntry>| {
+            format!("docs/{of}/{}", entry.unwrap().file_name().to_str().unwrap())
+        };
+        let mut names: Vec<String> = entries.map(name).collect();
+        names.sort();
+        names
+    };
+
+    let results = std::fs::read_to_string(folder.join("results.md")).unwrap();
+    for submission in files("submissions") {
+        let check = "benchmark check --benchmark docs/visits-4719.json";
+        here.prints(&format!("{check} --submission {submission}"), &["is valid"]);
+        let name = here.json(&submission)["name"].as_str().unwrap().to_owned();
+        assert!(results.contains(&format!("- **{name}**: ")), "{name}");
+    }
+
+    let metrics: Vec<String> = files("encoders")
+        .iter()
+        .map(|file| format!("--metrics {file}"))
+        .collect();
+    let compare = "benchmark encoders --benchmark docs/visits-4719.json --page page.md";
+    here.succeeds(&format!("{compare} {}", metrics.join(" ")));
+    let [page, committed] = [here.file("page.md"), folder.join("encoders.md")]
+        .map(|file| std::fs::read_to_string(file).unwrap());
+    assert_eq!(page, committed);
 }

@@ -24,6 +24,8 @@ use crate::probes::MutualKnn;
 const METRICS_FORMAT: &str = "seese3 feature metrics 1";
 /// Number of adapters of M4 per room and fold, with seeds from 0.
 const SEEDS: u64 = 3;
+/// Largest size of a metric: larger numbers are mistakes, and would overflow the means.
+const MOST: f64 = 1e6;
 
 /// M1 to M4 of a feature set in every room of a benchmark: the content of a file of metrics.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -193,14 +195,20 @@ impl FeatureMetrics {
             let Some(metrics) = self.rooms.get(&room.room) else {
                 return Err(Error::new(place(&room.room), "is missing"));
             };
-            if let Some(name) = metrics.not_finite() {
-                let place = format!("{}.{name}", place(&room.room));
-                return Err(Error::new(place, "must be a finite number"));
+            for (name, value) in metrics.named() {
+                let (range, words) = match name {
+                    "m1" => (0.0..=1.0, "from 0 to 1"),
+                    "m2_twonn" | "m2_mle" => (0.0..=MOST, "from 0 to 1000000"),
+                    _ => (-MOST..=1.0, "an R² of at most 1"),
+                };
+                if !range.contains(&value) {
+                    let place = format!("{}.{name}", place(&room.room));
+                    return Err(Error::new(place, format!("must be {words}")));
+                }
             }
-            if !(0.0..=1.0).contains(&metrics.m1) {
-                let place = format!("{}.m1", place(&room.room));
-                return Err(Error::new(place, "must be from 0 to 1"));
-            }
+        }
+        if self.source.dim == 0 {
+            return Err(Error::new("source.dim", "must be at least 1"));
         }
         Ok(())
     }

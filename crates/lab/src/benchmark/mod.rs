@@ -27,6 +27,9 @@ const BENCHMARK_FORMAT: &str = "seese3 benchmark 1";
 /// The format of a submission file.
 const SUBMISSION_FORMAT: &str = "seese3 submission 1";
 
+/// Largest number of letters of a name or an `about` text.
+const MOST_LETTERS: usize = 500;
+
 /// The name of the submission that stands still.
 const IDENTITY: &str = "identity";
 
@@ -388,7 +391,10 @@ impl Submission {
                 return Err(Error::new(place, problem));
             }
             if let Some(position) = frames.iter().position(|&row| !room.is_candidate(row)) {
-                let problem = format!("is {}, which is no candidate", frames[position]);
+                let problem = format!(
+                    "is {}, which is no candidate; the candidates are the rows {:?}",
+                    frames[position], room.candidates
+                );
                 return Err(Error::new(format!("{place}[{position}]"), problem));
             }
         }
@@ -490,7 +496,7 @@ fn check_benchmark(sha256: &str, benchmark: &Benchmark) -> Result<(), Error> {
 /// [`Error`] names the field.
 pub fn check_submission_text(name: &str, about: &str) -> Result<(), Error> {
     check_description(name, about, None)?;
-    if name == IDENTITY {
+    if name.to_lowercase() == IDENTITY {
         let problem = format!("'{IDENTITY}' is reserved for the baseline; choose another");
         return Err(Error::new("name", problem));
     }
@@ -522,8 +528,28 @@ fn check_text(place: &str, text: &str) -> Result<(), Error> {
     if text.trim().is_empty() {
         return Err(Error::new(place, "must not be empty"));
     }
-    if text.chars().any(|c| c.is_control() || "|<>`".contains(c)) {
-        return Err(Error::new(place, "must be one line without | < > and `"));
+    if text.trim() != text {
+        return Err(Error::new(place, "must not begin or end with a blank"));
+    }
+    // Letters that the eye does not see, and letters that mean something in Markdown and LaTeX.
+    let is_hidden = |c: char| {
+        matches!(c, '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}')
+            || matches!(c, '\u{2060}'..='\u{206f}' | '\u{feff}')
+    };
+    let is_markup = |c: char| "|<>`[]*\\^~&".contains(c);
+    if text
+        .chars()
+        .any(|c| c.is_control() || is_hidden(c) || is_markup(c))
+    {
+        let problem =
+            "must be one line without invisible letters and without | < > ` [ ] * \\ ^ ~ and &";
+        return Err(Error::new(place, problem));
+    }
+    if text.chars().count() > MOST_LETTERS {
+        return Err(Error::new(
+            place,
+            format!("must have at most {MOST_LETTERS} letters"),
+        ));
     }
     Ok(())
 }
@@ -598,7 +624,11 @@ mod tests {
         assert!(refused(&|it| it.benchmark = "0".to_owned()).starts_with("benchmark: "));
         assert!(refused(&|it| it.about = " ".to_owned()).starts_with("about: "));
         assert!(refused(&|it| it.about = "a\n# b".to_owned()).starts_with("about: "));
-        assert!(refused(&|it| it.name = "identity".to_owned()).starts_with("name: "));
+        for name in ["identity", "Identity", " mine", "a\u{200b}", "![x](y)"] {
+            let refused = refused(&|it| it.name = name.to_owned());
+            assert!(refused.starts_with("name: "), "{refused}");
+        }
+        assert!(refused(&|it| it.name = "a".repeat(501)).starts_with("name: "));
         assert!(refused(&|it| it.url = Some("javascript:x".to_owned())).starts_with("url: "));
         assert!(refused(&|it| it.frames.clear()).contains("is missing"));
         let other = refused(&|it| {

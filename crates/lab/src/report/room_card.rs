@@ -3,7 +3,7 @@
 use super::table::Column::{self, Text};
 use super::table::Table;
 use crate::experiments::room_card::{MedianError, RoomCard};
-use seese3_core::statistics::{mean_of_known, median};
+use seese3_core::statistics::median;
 
 /// One line per room, and a line of medians if there are several.
 pub fn room_card_table(cards: &[RoomCard]) -> Table {
@@ -60,7 +60,7 @@ pub fn medians(cards: &[RoomCard]) -> RoomCard {
     };
     let count = |of: fn(&RoomCard) -> usize| {
         let counts: Vec<f64> = cards.iter().map(|card| of(card) as f64).collect();
-        mean_of_known(&counts).round() as usize
+        median(&counts).round() as usize
     };
 
     RoomCard {

@@ -198,6 +198,10 @@ const TERMINAL_WIDTH: usize = 100;
 /// Between two columns.
 const GAP: usize = 2;
 
+/// Largest width to which cells are padded: larger ones are a mistake, and `format!` panics beyond
+/// 65,535.
+const WIDEST: usize = 1_000;
+
 /// Every column is as wide as its widest cell. The first is left-aligned, the others are
 /// right-aligned. A table wider than 100 characters is folded: its columns follow in blocks, each
 /// of which begins with the first column. There is no line break after the last line.
@@ -235,10 +239,10 @@ impl Table {
         block: Range<usize>,
     ) -> fmt::Result {
         for (place, line) in self.lines.iter().enumerate() {
-            let mut text = format!("{:1$}", line[0], widths[0]);
+            let mut text = format!("{:1$}", line[0], widths[0].min(WIDEST));
             for column in block.clone() {
                 let cell = line.get(column).map_or("", String::as_str);
-                text.push_str(&format!("  {cell:>0$}", widths[column]));
+                text.push_str(&format!("  {cell:>0$}", widths[column].min(WIDEST)));
             }
 
             // A left-aligned or empty last cell leaves trailing blanks.

@@ -7,9 +7,10 @@
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use seese3_core::statistics::{
-    CrossedMean, RoomMean, bootstrap_mean, crossed_mean, holm, mean, sign_flip_p,
+    CrossedMean, RoomMean, bootstrap_mean, crossed_mean, holm, mean, mean_of_known, sign_flip_p,
 };
 
+use crate::experiments::cross_room::clipped_r2;
 use crate::report::Column::{self, Text};
 use crate::report::{Section, Table, room_difference_text};
 
@@ -195,6 +196,16 @@ fn means_of_rooms(by_training: &[Vec<f64>]) -> Vec<f64> {
     let of_room = |room: usize| {
         let values: Vec<f64> = by_training.iter().map(|values| values[room]).collect();
         mean(&values)
+    };
+    (0..rooms).map(of_room).collect()
+}
+
+/// max(R², −1) of each room's mean over seeds. A seed without a value is left out.
+pub fn clipped_means(by_seed: &[Vec<f64>]) -> Vec<f64> {
+    let rooms = by_seed.first().map_or(0, Vec::len);
+    let of_room = |room: usize| {
+        let of_seeds: Vec<f64> = by_seed.iter().map(|rooms| rooms[room]).collect();
+        clipped_r2(mean_of_known(&of_seeds))
     };
     (0..rooms).map(of_room).collect()
 }
@@ -419,6 +430,14 @@ mod tests {
 
         assert_eq!(claims[0].verdict, Verdict::CannotTell);
         assert!(claims[0].cases.iter().all(|case| case.reason.is_some()));
+    }
+
+    /// Oracle: by hand: the mean is clipped, not the seeds, and an unknown seed is left out.
+    #[test]
+    fn seeds_are_averaged_before_they_are_clipped() {
+        let by_seed = [vec![0.5, -3.0, f64::NAN], vec![0.25, 2.0, 0.5]];
+        assert_eq!(clipped_means(&by_seed), [0.375, -0.5, 0.5]);
+        assert_eq!(clipped_means(&[vec![-4.0]]), [-1.0]);
     }
 
     /// Oracle: by hand, and for one training the bootstrap over rooms.

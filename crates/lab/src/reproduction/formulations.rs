@@ -5,11 +5,9 @@ use serde_json::json;
 
 use seese3_core::adapter::Preset;
 use seese3_core::splits::Split;
-use seese3_core::statistics::mean_of_known;
 
-use super::claims::{Case, Claim, encoders_and_control};
+use super::claims::{Case, Claim, clipped_means, encoders_and_control};
 use super::{Error, FeatureSet, Found, Reproduction, paper};
-use crate::experiments::cross_room::clipped_r2;
 use crate::experiments::formulations::{
     Comparison, FormulationPlan, FormulationScores, RoomPooling, compare, run_formulation,
 };
@@ -94,14 +92,7 @@ pub fn section(given: &Reproduction<'_>) -> Result<Found<Vec<FormulationRecord>>
 
 /// The adapter's R² minus that of each alternative, by room.
 fn over_alternatives(features: &str, compared: &Comparison) -> Vec<Case> {
-    let by_room = |scores: &FormulationScores| -> Vec<f64> {
-        let by_seed = &scores.r2_by_seed_and_room;
-        let room = |room: usize| {
-            let of_seeds: Vec<f64> = by_seed.iter().map(|rooms| rooms[room]).collect();
-            clipped_r2(mean_of_known(&of_seeds))
-        };
-        (0..by_seed.first().map_or(0, Vec::len)).map(room).collect()
-    };
+    let by_room = |scores: &FormulationScores| clipped_means(&scores.r2_by_seed_and_room);
 
     // The adapter comes first in `Formulation::VARIANTS`.
     let Some((adapter, alternatives)) = compared.formulations.split_first() else {

@@ -207,6 +207,21 @@ pub fn check(given: &Reproduction<'_>) -> Result<(), Error> {
         }
     }
 
+    for set in &given.sets {
+        let rooms = [&set.train, &set.test, &set.in_room];
+        let first = set.train.first();
+        let is_other = |data: &&RoomData<'_>| {
+            first.is_some_and(|first| !data.features.source().is_like(first.features.source()))
+        };
+        if let Some(data) = rooms.into_iter().flatten().find(is_other) {
+            return Err(Error::Input(format!(
+                "room '{}': its features '{}' were made in another way than those of the first --train room",
+                data.room.id(),
+                set.features
+            )));
+        }
+    }
+
     // Every set has the same rooms, so checking the first one is enough.
     if let Some(set) = given.sets.first() {
         let Options {
@@ -216,6 +231,7 @@ pub fn check(given: &Reproduction<'_>) -> Result<(), Error> {
         check_pairs(&set.in_room, "--in-room", &Split::FOLDS, &all_strides)?;
         check_pairs(&set.in_room, "--in-room", &[Split::Blocks], &[*stride])?;
         check_pairs(&set.test, "--test", &Split::FOLDS, &[*stride])?;
+        check_pairs(&set.train, "--train", &[Split::Whole], &[*stride])?;
     }
     let rooms = given.sets.first().map_or(0, |set| set.train.len());
     let is_out_of_range = |size: &&usize| **size == 0 || **size > rooms;

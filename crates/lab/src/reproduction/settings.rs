@@ -6,12 +6,10 @@ use serde::Serialize;
 use seese3_core::adapter::{Loss, Preset};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::splits::Split;
-use seese3_core::statistics::mean_of_known;
 use seese3_core::training::{RoomData, TrainingPlan};
 
-use super::claims::{Case, Claim};
+use super::claims::{Case, Claim, clipped_means};
 use super::{Error, FeatureSet, Found, Reproduction};
-use crate::experiments::cross_room::clipped_r2;
 use crate::experiments::folds::FoldedMotions;
 use crate::formulations::read_by_adapter;
 use crate::report::Column::{self, Text};
@@ -135,12 +133,7 @@ fn losses(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Result<Vec<LossReco
 fn claim(set: &FeatureSet<'_>, losses: &[LossRecord]) -> Claim {
     let by_room = |loss: Loss| -> Vec<f64> {
         let found = losses.iter().find(|found| found.loss == loss.name());
-        let by_seed = found.map_or(&[][..], |found| &found.rotation_by_seed_and_room);
-        let room = |room: usize| {
-            let of_seeds: Vec<f64> = by_seed.iter().map(|rooms| rooms[room]).collect();
-            clipped_r2(mean_of_known(&of_seeds))
-        };
-        (0..set.in_room.len()).map(room).collect()
+        clipped_means(found.map_or(&[][..], |found| &found.rotation_by_seed_and_room))
     };
 
     let joint = by_room(Loss::MeanSquaredError);
