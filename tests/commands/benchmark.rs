@@ -8,7 +8,9 @@ use crate::program::Place;
 fn submissions_are_scored_as_evaluate_scores() {
     let here = Place::new();
     here.succeeds(&Place::import("r", "synthetic"));
-    here.succeeds("train --store store --room r --epochs 2 --split whole --stride 20 --name base");
+    here.succeeds(&Place::import("r2", "synthetic_b"));
+    here.succeeds("train --store store --room r2 --epochs 2 --split whole --stride 20 --name base");
+    here.succeeds("train --store store --room r --epochs 2 --split whole --stride 20 --name seen");
     let frozen = here.prints(
         "benchmark freeze --store store --room r --stride 20 --name small --out small.json",
         &["benchmark 'small': 1 rooms, 580 pairs"],
@@ -18,6 +20,10 @@ fn submissions_are_scored_as_evaluate_scores() {
     let answer =
         "benchmark answer --benchmark small.json --store store --adapter base --name paper --about";
     here.succeeds(&format!("{answer} affine --out paper.json"));
+    let seen = "benchmark answer --benchmark small.json --store store --adapter seen --name x --about x --out x.json";
+    here.refuses(seen, &["'seen' was trained", "'r'"]);
+    let oracle = format!("{answer} x --out x.json --navigator oracle");
+    here.refuses(&oracle, &["'oracle' uses the targets"]);
     let check = "benchmark check --benchmark small.json";
     here.prints(
         &format!("{check} --submission paper.json"),
@@ -87,7 +93,7 @@ fn features_are_measured_as_probe_measures() {
     ));
     here.succeeds(
         "probe --store store --room r --features fourier --stride 20 --split folds --preset base \
-         --m1-stride 2 --m2-gap 0 --json probe.json",
+         --m1-stride 3 --m1-frames 200 --m2-gap 0 --json probe.json",
     );
 
     let [ours, theirs] = ["mine.json", "probe.json"].map(|file| here.json(file));
