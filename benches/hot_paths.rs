@@ -30,6 +30,7 @@ use seese3_core::navigation::{
     RetrievalMetric, Source, SourceAt, StepKind,
 };
 use seese3_core::room::{FrameId, Frames, Provenance, Room, RoomId};
+use seese3_testing::panorama::{self, Panorama};
 
 const DIM: usize = 768;
 
@@ -162,6 +163,37 @@ fn one_answer(criterion: &mut Criterion) {
                     });
                 },
             );
+        }
+    }
+
+    group.finish();
+}
+
+/// One answer of the relational reader, by the number of candidate frames; the peer is inverse
+/// Poincaré with the same adapter. The reader of the tests is small: 16 hidden columns, two members.
+fn relational(criterion: &mut Criterion) {
+    let (adapter, _) = panorama::adapter(true);
+    let adapter = Arc::new(adapter);
+    let mut group = criterion.benchmark_group("relational");
+    for frame_count in [128, 1_024] {
+        let seen = Panorama::new("bench", 7, frame_count);
+        let room = Arc::new(seen.room.clone());
+        let navigator =
+            Navigator::new(room, &seen.joined, adapter.clone(), IndexKind::Exact).unwrap();
+        group.throughput(Throughput::Elements(frame_count as u64));
+
+        for (name, method) in [
+            ("relational", Method::Relational),
+            ("inverse-poincare", query(1).method),
+        ] {
+            let query = Query { method, ..query(1) };
+            group.bench_function(BenchmarkId::new(name, frame_count), |bencher| {
+                bencher.iter(|| {
+                    navigator
+                        .answer(&query, Limits::default(), &Cancellation::default())
+                        .unwrap()
+                });
+            });
         }
     }
 
@@ -351,5 +383,5 @@ async fn serve(folder: &str) -> (Client, tonic::transport::Channel) {
     (client, endpoint.connect().await.unwrap())
 }
 
-criterion_group!(benches, one_answer, scan, epoch, rpc);
+criterion_group!(benches, one_answer, relational, scan, epoch, rpc);
 criterion_main!(benches);

@@ -93,7 +93,7 @@ fn features_are_measured_as_probe_measures() {
     ));
     here.succeeds(
         "probe --store store --room r --features fourier --stride 20 --split folds --preset base \
-         --m1-stride 3 --m1-frames 200 --m2-gap 0 --json probe.json",
+         --m1-stride 3 --m1-frames 200 --m2-gap 0 --json probe.json -q",
     );
 
     let [ours, theirs] = ["mine.json", "probe.json"].map(|file| here.json(file));

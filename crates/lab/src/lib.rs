@@ -31,8 +31,8 @@
 //! | [`formulations`] | the paper's alternatives A to D to the adapter |
 //! | [`probes`] | probes M1 to M3 of the SE(3) information in features; M4 trains an adapter |
 //! | [`theory`] | numeric checks of the paper's theorems |
-//! | [`benchmark`] | frozen rooms and pairs, submissions and their scores |
 //! | [`experiments`] | experiments over rooms, with their result types |
+//! | [`benchmark`] | frozen rooms and pairs, submissions and their scores, metrics of features |
 //! | [`report`] | tables, JSON, pictures and documents of the results |
 //! | [`reproduction`] | the paper's tables and figures on given rooms, as one report |
 //!
@@ -42,7 +42,7 @@ mod json;
 pub mod formulations;
 pub mod probes;
 pub mod theory;
-pub mod benchmark;
 pub mod experiments;
+pub mod benchmark;
 pub mod report;
 pub mod reproduction;
