@@ -72,10 +72,11 @@ impl RoomMetrics {
     /// Measures the features of a room. `stride` is that of the benchmark, in frames.
     ///
     /// M1: at most 256 frames at the smallest stride that spans the recording, k 10, 10 of them to
-    /// each side left out. M2: without a gap. M3 and M4: five folds, whose test pairs are scored together; M4: preset `base`, seeds 0 to 2.
+    /// each side left out. M2: without a gap. M3 and M4: five folds, whose test pairs are scored
+    /// together; M4: preset `base`, seeds 0 to 2.
     ///
     /// # Errors
-    /// [`experiments::Error`] with the name of the failed metric; a metric that is not a number.
+    /// [`experiments::Error`] with the name of the failed metric; a metric that is undefined.
     pub fn measure(data: &RoomData<'_>, stride: u32) -> Result<Self, experiments::Error> {
         // The splits of the plans are replaced by those of the protocol.
         let plan = TrainingPlan::of(Preset::Base, Split::Whole, stride, 0);
@@ -97,6 +98,7 @@ impl RoomMetrics {
         let (Some(ridge), Some(adapter)) = (scores.m3.first(), scores.m4.first()) else {
             return Err(undefined("m3 or m4"));
         };
+
         let constant = ridge.baselines.ok_or_else(|| undefined("constant"))?;
         let metrics = Self {
             m1: m1.share,
@@ -191,10 +193,13 @@ impl FeatureMetrics {
         if let Some(other) = self.rooms.keys().find(|name| !known(name)) {
             return Err(Error::new(place(other), "is no room of the benchmark"));
         }
+
         for room in &benchmark.rooms {
             let Some(metrics) = self.rooms.get(&room.room) else {
                 return Err(Error::new(place(&room.room), "is missing"));
             };
+
+            // M1 is a share, M2 a dimension; the others are R².
             for (name, value) in metrics.named() {
                 let (range, words) = match name {
                     "m1" => (0.0..=1.0, "from 0 to 1"),
@@ -207,6 +212,7 @@ impl FeatureMetrics {
                 }
             }
         }
+
         if self.source.dim == 0 {
             return Err(Error::new("source.dim", "must be at least 1"));
         }

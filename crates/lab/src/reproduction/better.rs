@@ -113,14 +113,18 @@ fn every_second(by_training: &[Vec<f64>], first: usize) -> Vec<Vec<f64>> {
 }
 
 fn chosen(set: &SetResults) -> Option<Chosen<'_>> {
+    // The rooms at even places choose.
     let choosing = |results: &KindResults| {
         let hits = hit_rates(&results.runs, navigator_of(results));
         or_worst(mean_of_known(&every_second(&hits, 0).concat()))
     };
+
+    // The baseline is no row of ours.
     let ours = set.on_all_rooms.iter();
     let best = ours
         .filter(|results| results.kind != PlanKind::PaperRange)
         .max_by(|a, b| choosing(a).total_cmp(&choosing(b)))?;
+
     let navigator = navigator_of(best);
     Some(Chosen {
         kind: best.kind,
@@ -166,6 +170,7 @@ fn claims_of(results: &[SetResults]) -> [Claim; 3] {
         };
         results.iter().filter_map(case).collect()
     };
+
     let calibrated = of_kind(PlanKind::PaperRangeCalibrated, &|set, results| {
         let baseline = hit_rates(set.baseline(), HOMOGENEOUS);
         Case::of_paired_trainings(
@@ -174,6 +179,7 @@ fn claims_of(results: &[SetResults]) -> [Claim; 3] {
             &baseline,
         )
     });
+
     let steady = of_kind(PlanKind::Steady, &|set, results| {
         Case::of_paired_trainings(
             &set.features,
@@ -181,6 +187,7 @@ fn claims_of(results: &[SetResults]) -> [Claim; 3] {
             &clipped(set.baseline()),
         )
     });
+
     let best = results.iter().filter_map(chosen).map(|chosen| {
         let case = format!("{}: {}", chosen.set.features, chosen.kind.name());
         Case::of_paired_trainings(case, &chosen.hits, &chosen.baseline(HOMOGENEOUS))
@@ -223,6 +230,7 @@ fn compared(set: &SetResults, results: &KindResults) -> BetterRecord {
         let theirs = hit_rates(set.baseline(), name);
         mean_over_trainings(&differences(&ours, &theirs))
     };
+
     let r2 = clipped(runs);
     let over_baseline = differences(&r2, &clipped(set.baseline()));
     let is_positive: Vec<f64> = r2
@@ -232,12 +240,14 @@ fn compared(set: &SetResults, results: &KindResults) -> BetterRecord {
         .map(|r2| f64::from(u8::from(r2 > 0.0)))
         .collect();
 
+    // All trainings have as many rooms for training and for calibration.
     let first = &runs[0];
     let plan = AdapterPlan {
         kind: *kind,
         rooms: first.training_rooms.len() + first.calibration_rooms.len(),
         seed: 0,
     };
+
     BetterRecord {
         features: set.features.clone(),
         plan: *kind,
