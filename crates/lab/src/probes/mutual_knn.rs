@@ -326,4 +326,19 @@ mod tests {
             .apart(3, 3)
         );
     }
+
+    /// Oracle: by hand: the last frame compared is less than a stride from the end.
+    #[test]
+    fn the_long_stride_spans_the_recording() {
+        for (frame_count, stride, frames) in [
+            (100, 1, 100),
+            (256, 1, 256),
+            (257, 2, 129),
+            (400, 2, 200),
+            (1_000, 4, 250),
+        ] {
+            let options = MutualKnn::spanning(frame_count);
+            assert_eq!((options.stride, options.frames), (stride, frames));
+        }
+    }
 }
