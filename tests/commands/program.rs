@@ -176,7 +176,7 @@ pub fn said(output: &Output) -> String {
     lines.collect::<Vec<_>>().join("\n") + end
 }
 
-/// Whether a line is "WHAT: N of M after S s, ..." or "WHAT: N after S s ...".
+/// Whether a line is "WHAT: N of M after S s, ...", "WHAT: N of M after S s" or "WHAT: N after S s ...".
 fn is_progress(line: &str) -> bool {
     let is_number = |word: &str| word.parse::<u64>().is_ok();
     let Some((_, counted)) = line.split_once(": ") else {
@@ -184,7 +184,7 @@ fn is_progress(line: &str) -> bool {
     };
 
     match counted.split(' ').collect::<Vec<_>>()[..] {
-        [count, "of", length, "after", seconds, "s,", ..] => {
+        [count, "of", length, "after", seconds, "s," | "s", ..] => {
             [count, length, seconds].into_iter().all(is_number)
         }
         [count, "after", seconds, "s", ..] => is_number(count) && is_number(seconds),
@@ -198,6 +198,7 @@ fn lines_of_progress_are_no_errors() {
     assert!(is_progress(
         "training: 3 of 250 after 30 s, about 9 s left loss 0.1"
     ));
+    assert!(is_progress("training the reader: 0 of 1 after 30 s"));
     assert!(is_progress("reading: 31 after 60 s"));
     assert!(!is_progress("error: 3 of 250 frames after 30 s are lost"));
     assert!(!is_progress("warning: 3 frames come after 30 s"));

@@ -69,7 +69,7 @@ pub(super) fn normalize<T: Real>(rows: &mut Array2<T>) -> Array2<T> {
     {
         let mean = row.sum() / width;
         row.mapv_inplace(|x| x - mean);
-        let variance = row.fold(T::zero(), |sum, &x| sum + x * x) / width;
+        let variance = row.dot(&row) / width;
         scale[0] = (variance + T::of(LAYER_NORM_EPS)).sqrt().recip();
 
         row.mapv_inplace(|x| x * scale[0]);
@@ -95,11 +95,7 @@ pub(super) fn normalize_backward<T: Real>(
         // dx = (dy − mean(dy) − y · mean(dy ⊙ y)) / deviation.
         let mean = row.sum() / width;
 
-        let along = row
-            .iter()
-            .zip(&normalized)
-            .fold(T::zero(), |sum, (&d, &x)| sum + d * x)
-            / width;
+        let along = row.dot(&normalized) / width;
         Zip::from(&mut row)
             .and(&normalized)
             .for_each(|d, &x| *d = *scale * (*d - mean - x * along));
@@ -109,22 +105,17 @@ pub(super) fn normalize_backward<T: Real>(
 /// Φ(x), the cumulative distribution function of the standard normal distribution. Exact GELU is x
 /// Φ(x).
 pub(super) fn cumulative<T: Real>(input: &Array2<T>) -> Array2<T> {
-    input.mapv(|x| T::of(0.5) * (T::one() + (x * T::of(std::f64::consts::FRAC_1_SQRT_2)).erf()))
+    input.mapv(T::normal_cumulative)
 }
 
 /// Turns `d` from the gradient with respect to GELU's output into the gradient with respect to its
 /// input x. The derivative is Φ(x) + x p(x), with p the density of the standard normal
 /// distribution.
 pub(super) fn gelu_backward<T: Real>(d: &mut Array2<T>, input: &Array2<T>, cumulative: &Array2<T>) {
-    let density_scale = T::of((2.0 * std::f64::consts::PI).sqrt().recip());
-    let half = T::of(0.5);
-
     Zip::from(d)
         .and(input)
         .and(cumulative)
-        .for_each(|d, &x, &cumulative| {
-            *d *= cumulative + x * density_scale * (-half * x * x).exp();
-        });
+        .for_each(|d, &x, &cumulative| *d *= cumulative + x * x.normal_density());
 }
 
 /// Linear layers with GELU between them.

@@ -418,7 +418,7 @@ impl<T: Real> Objective<T> for Mixture<T> {
         let forward: Vec<_> = self
             .charts
             .iter()
-            .map(|chart| chart.phi.forward(batch.features.clone()))
+            .map(|chart| chart.phi.forward(&batch.features))
             .collect();
         let steps: Vec<_> = forward
             .iter()
@@ -459,12 +459,12 @@ impl<T: Real> Objective<T> for Mixture<T> {
                 None => &d_predicted * self.even_share(),
             };
 
-            let into = &mut gradient.charts[position];
+            let (forward, into) = (&forward[position], &mut gradient.charts[position]);
             into.motion += &d_motion.t().dot(&steps[position]);
             let d_latents = batch.scattered(&d_motion.dot(&chart.motion));
             chart
                 .phi
-                .backward(&forward[position], &d_latents, &mut into.phi);
+                .backward(&batch.features, forward, &d_latents, &mut into.phi);
         }
 
         if let (Some(gate), Some((routed, alpha, scores)), Some(into)) =

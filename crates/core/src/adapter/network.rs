@@ -101,8 +101,8 @@ impl<T: Real> AdamW<T> {
         let gradient = gradient.parameters();
         let squares: f64 = gradient
             .iter()
-            .flat_map(|tensor| tensor.iter())
-            .map(|x| x.f64() * x.f64())
+            .flat_map(|tensor| tensor.rows())
+            .map(|row| row.dot(&row).f64())
             .sum();
         let gradient_norm = squares.sqrt();
 

@@ -29,7 +29,6 @@ pub struct Phi<T> {
 
 /// Intermediate values of the forward pass that the backward pass uses.
 pub struct Activations<T> {
-    input: Array2<T>,
     normalized: Array2<T>,
     inverse_deviation: Array2<T>,
     scaled: Array2<T>,
@@ -157,7 +156,7 @@ impl<T: Real> Phi<T> {
     }
 
     /// The forward pass of feature rows, shape (n, d).
-    pub fn forward(&self, input: Array2<T>) -> Activations<T> {
+    pub fn forward(&self, input: &Array2<T>) -> Activations<T> {
         let [
             first_weight,
             first_bias,
@@ -167,7 +166,7 @@ impl<T: Real> Phi<T> {
             last_bias,
         ] = &self.tensors;
 
-        let mut normalized = linear(&input, first_weight, first_bias);
+        let mut normalized = linear(input, first_weight, first_bias);
         let inverse_deviation = normalize(&mut normalized);
         let scaled = &normalized * norm_weight + norm_bias;
 
@@ -177,7 +176,6 @@ impl<T: Real> Phi<T> {
         let latents = linear(&hidden, last_weight, last_bias);
 
         Activations {
-            input,
             normalized,
             inverse_deviation,
             scaled,
@@ -187,13 +185,19 @@ impl<T: Real> Phi<T> {
         }
     }
 
-    /// Adds the gradient of the parameters to `gradient`; `d_latents` is the gradient with respect
-    /// to the latents, shape (n, k).
+    /// Adds the gradient of the parameters to `gradient`; `input` are the rows of the forward pass,
+    /// `d_latents` is the gradient with respect to the latents, shape (n, k).
     ///
     /// The last bias is skipped. It cancels in the difference of two latents, so its gradient is
     /// exactly zero; Adam would amplify the rounding errors to the full learning rate.
     /// [`Phi::backward_whole`] includes it.
-    pub fn backward(&self, forward: &Activations<T>, d_latents: &Array2<T>, gradient: &mut Self) {
+    pub fn backward(
+        &self,
+        input: &Array2<T>,
+        forward: &Activations<T>,
+        d_latents: &Array2<T>,
+        gradient: &mut Self,
+    ) {
         let [_, _, norm_weight, _, last_weight, _] = &self.tensors;
         gradient.tensors[4] += &d_latents.t().dot(&forward.hidden);
         let mut d_scaled = d_latents.dot(last_weight);
@@ -209,7 +213,7 @@ impl<T: Real> Phi<T> {
             &forward.inverse_deviation,
         );
 
-        gradient.tensors[0] += &d_first.t().dot(&forward.input);
+        gradient.tensors[0] += &d_first.t().dot(input);
         gradient.tensors[1] += &d_first.sum_axis(Axis(0));
     }
 
@@ -217,11 +221,12 @@ impl<T: Real> Phi<T> {
     /// a gradient.
     pub fn backward_whole(
         &self,
+        input: &Array2<T>,
         forward: &Activations<T>,
         d_latents: &Array2<T>,
         gradient: &mut Self,
     ) {
-        self.backward(forward, d_latents, gradient);
+        self.backward(input, forward, d_latents, gradient);
         gradient.tensors[5] += &d_latents.sum_axis(Axis(0));
     }
 }

@@ -123,7 +123,7 @@ impl<T: Real> Siamese<T> {
 
     /// φ of feature rows, shape (n, d) in, (n, k) out.
     pub fn embed(&self, features: Array2<T>) -> Array2<T> {
-        self.phi.forward(features).latents
+        self.phi.forward(&features).latents
     }
 }
 

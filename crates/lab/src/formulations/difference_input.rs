@@ -59,7 +59,8 @@ impl<T: Real> Objective<T> for DifferenceInput<T> {
 
     fn gradient(&self, samples: &Samples<T>, batch: &[usize], at: At<'_>) -> (f64, Self) {
         let rows = samples.batch(batch, at);
-        let forward = self.0.phi.forward(rows.differences(&rows.features));
+        let differences = rows.differences(&rows.features);
+        let forward = self.0.phi.forward(&differences);
         let predicted = forward.latents.dot(&self.0.motion.t());
         let (loss, d_predicted) = at.config.loss.value(predicted.view(), rows.targets.view());
 
@@ -68,6 +69,7 @@ impl<T: Real> Objective<T> for DifferenceInput<T> {
 
         // Latents are not subtracted here: the last bias of φ does not cancel and has a gradient.
         self.0.phi.backward_whole(
+            &differences,
             &forward,
             &d_predicted.dot(&self.0.motion),
             &mut gradient.0.phi,

@@ -34,8 +34,11 @@ impl<T: Real> GeodesicHead<T> {
 
     /// The motions between features (n, d), each in the body frame of its source.
     pub fn motions(&self, features: [ArrayView2<'_, f32>; 2]) -> Vec<Twist> {
-        let latents =
-            features.map(|rows| self.phi.forward(rows.mapv(|x| T::of(f64::from(x)))).latents);
+        let latents = features.map(|rows| {
+            self.phi
+                .forward(&rows.mapv(|x| T::of(f64::from(x))))
+                .latents
+        });
         let [from, to] = latents;
         let poses = self.head.forward(to - from).output;
 
@@ -81,7 +84,7 @@ impl<T: Real> Objective<T> for GeodesicHead<T> {
 
     fn gradient(&self, samples: &Samples<T>, batch: &[usize], at: At<'_>) -> (f64, Self) {
         let rows = samples.batch(batch, at);
-        let forward = self.phi.forward(rows.features.clone());
+        let forward = self.phi.forward(&rows.features);
         let head = self.head.forward(rows.differences(&forward.latents));
         let mut d_numbers = Array2::zeros(head.output.dim());
 
@@ -106,8 +109,12 @@ impl<T: Real> Objective<T> for GeodesicHead<T> {
         let d_differences = self.head.backward(&head, &d_numbers, &mut gradient.head);
 
         // The latents are subtracted, so the last bias of φ cancels and has no gradient.
-        self.phi
-            .backward(&forward, &rows.scattered(&d_differences), &mut gradient.phi);
+        self.phi.backward(
+            &rows.features,
+            &forward,
+            &rows.scattered(&d_differences),
+            &mut gradient.phi,
+        );
 
         (loss, gradient)
     }

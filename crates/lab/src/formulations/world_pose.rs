@@ -37,7 +37,7 @@ impl<T: Real> WorldPose<T> {
         let poses = |end: usize| {
             let rows = self
                 .psi
-                .forward(ends.features[end].mapv(|x| T::of(f64::from(x))))
+                .forward(&ends.features[end].mapv(|x| T::of(f64::from(x))))
                 .latents;
             rows.outer_iter()
                 .map(|row| HeadPose::of(row).pose)
@@ -71,7 +71,7 @@ impl<T: Real> WorldPose<T> {
     ) -> (f64, Self) {
         // ψ runs once per distinct frame of the batch. A frame sums the gradients of its pairs.
         let rows = samples.batch(batch, at);
-        let forward = self.psi.forward(rows.features.clone());
+        let forward = self.psi.forward(&rows.features);
         let heads: Vec<HeadPose> = forward
             .latents
             .outer_iter()
@@ -101,7 +101,7 @@ impl<T: Real> WorldPose<T> {
 
         // A pose is one output of ψ, not a difference of two, so the last bias has a gradient.
         self.psi
-            .backward_whole(&forward, &d_rows, &mut gradient.psi);
+            .backward_whole(&rows.features, &forward, &d_rows, &mut gradient.psi);
 
         (loss, gradient)
     }

@@ -147,7 +147,7 @@ impl<T: Real> RelationalNetwork<T> {
 
     /// The outputs for rows of inputs, shape (n, 27).
     pub fn outputs(&self, inputs: Array2<T>) -> Array2<T> {
-        let between = self.body.forward(inputs).latents;
+        let between = self.body.forward(&inputs).latents;
         let hidden = &between * &cumulative(&between);
         linear(&hidden, &self.head[0], &self.head[1])
     }
@@ -275,7 +275,7 @@ impl<T: Real> RelationalNetwork<T> {
     /// The mean negative log-likelihood of targets, in units of [`UNIT`], for rows of inputs, and
     /// its gradient.
     fn loss_gradient(&self, inputs: Array2<T>, targets: &[[f64; 6]]) -> (f64, Self) {
-        let forward = self.body.forward(inputs);
+        let forward = self.body.forward(&inputs);
         let between = cumulative(&forward.latents);
         let hidden = &forward.latents * &between;
         let outputs = linear(&hidden, &self.head[0], &self.head[1]);
@@ -303,7 +303,7 @@ impl<T: Real> RelationalNetwork<T> {
         let mut d_between = d_outputs.dot(&self.head[0]);
         gelu_backward(&mut d_between, &forward.latents, &between);
         self.body
-            .backward_whole(&forward, &d_between, &mut gradient.body);
+            .backward_whole(&inputs, &forward, &d_between, &mut gradient.body);
 
         (total, gradient)
     }
