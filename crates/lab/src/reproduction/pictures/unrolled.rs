@@ -36,8 +36,9 @@ pub fn add(section: &mut Section, data: &RoomData<'_>, adapter: &Adapter) -> Res
         let picture = Figure::new(title, "meters", "meters", both).svg()?;
 
         let caption = format!(
-            "The true path in its plane, and the two main directions of {what} laid over it: {off_m:.2} m off (root mean \
-             square); the middle of the path is {off_if_still:.2} m off"
+            "Room {}: the true path in its plane, and the two main directions of {what} laid over it: {off_m:.2} m off (root mean \
+             square); the middle of the path is {off_if_still:.2} m off",
+            data.room.id()
         );
         section.picture(name, picture, caption);
     }
