@@ -11,13 +11,13 @@ use seese3_core::cancel::Cancellation;
 use seese3_core::eval::{Protocol, Report, Row, evaluate};
 use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::splits::Split;
-use seese3_core::statistics::mean_of_known;
+use seese3_core::statistics::{RoomMean, bootstrap_mean, mean, mean_of_known};
 use seese3_core::training::{RoomData, train_adapter};
 
 use super::adapters::{Adapters, ReproducedAdapter};
 use super::claims::{Case, Claim, encoders_and_control};
 use super::{Error, Found, Reproduction, paper};
-use crate::report::{Figure, Section, Series, Table, fixed};
+use crate::report::{Figure, Section, Series, Table, fixed, room_mean_text};
 
 /// Number of training epochs for the navigation table, on all pairs at one stride.
 const NAVIGATION_EPOCHS: usize = 200;
@@ -32,6 +32,8 @@ pub struct NavigationRecord {
     top1: f64,
     /// One hit rate per threshold ε.
     hits: Vec<f64>,
+    /// The first of them with its interval over rooms.
+    hit: RoomMean,
     /// The adapters' names in the store, one per room.
     adapters: Vec<String>,
     /// Numbers of pairs, one per room.
@@ -81,7 +83,7 @@ pub fn section(
 
     section.text(format!(
         "Means over the in-room rooms: stride {}, last fifth of each recording, candidates are its \
-         frames, source included, one seed; adapters and correctors of {} epochs on all pairs at the \
+         frames, source included, one seed; intervals are over rooms; adapters and correctors of {} epochs on all pairs at the \
          stride. 'in-sample' is fitted on the scored pairs: a leak, and the likely protocol of the paper's refit.",
         given.options.stride,
         given.options.epochs.unwrap_or(NAVIGATION_EPOCHS)
@@ -108,10 +110,12 @@ fn table(thresholds: &[f64], rows: &[NavigationRecord]) -> Table {
     ));
 
     for row in rows {
-        let numbers = [row.mse, row.r2, row.top1]
+        let hits = row.hits[1..].iter().map(|hit| format!("{hit:.3}"));
+        let cells = fixed([row.mse, row.r2, row.top1], 3)
             .into_iter()
-            .chain(row.hits.iter().copied());
-        table.row(&row.navigator, numbers.map(|number| format!("{number:.3}")));
+            .chain([room_mean_text(&row.hit)])
+            .chain(hits);
+        table.row(&row.navigator, cells);
     }
     for (name, numbers) in paper::NAVIGATION {
         table.row(format!("paper: {name}"), fixed(numbers, 3));
@@ -211,7 +215,10 @@ impl Navigated<'_> {
             let rows = self.reports.iter().map(|report| of(&report.rows[place]));
             mean_of_known(&rows.collect::<Vec<f64>>())
         };
-        let hits = 0..first.protocol.thresholds.len();
+        let hits = |epsilon: usize| -> Vec<f64> {
+            let rows = self.reports.iter().map(|report| &report.rows[place]);
+            rows.map(|row| row.retrieval.hits[epsilon].1.rate).collect()
+        };
 
         // A row without latents has no MSE and no R²; the mean over rooms skips NaN.
         NavigationRecord {
@@ -220,9 +227,10 @@ impl Navigated<'_> {
             mse: over_rooms(&|row| row.latent.map_or(f64::NAN, |latent| latent.mse)),
             r2: over_rooms(&|row| row.latent.map_or(f64::NAN, |latent| latent.r2)),
             top1: over_rooms(&|row| row.retrieval.top1.rate),
-            hits: hits
-                .map(|epsilon| over_rooms(&|row| row.retrieval.hits[epsilon].1.rate))
+            hits: (0..first.protocol.thresholds.len())
+                .map(|epsilon| mean(&hits(epsilon)))
                 .collect(),
+            hit: bootstrap_mean(&hits(0), 0),
             adapters: self.adapters.clone(),
             n: self.reports.iter().map(|report| report.n).collect(),
         }
