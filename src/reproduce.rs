@@ -110,7 +110,7 @@ impl LoadedSet {
     }
 }
 
-/// The rooms that are learned alone, with the features of one layer.
+/// The in-room rooms with the features of one layer.
 struct LoadedLayer {
     features: String,
     rooms: Vec<Loaded>,

@@ -134,7 +134,10 @@ fn features_are_measured_as_probe_measures() {
     let m4 = format!("\"m4\": {}", ours["m4"]);
     assert!(text.contains(&m4), "{text}");
     std::fs::write(here.file("wrong.json"), text.replace(&m4, "\"m4\": 9.5")).unwrap();
-    here.refuses(compare_wrong, &["rooms.r.m4: must be an R² of at most 1"]);
+    here.refuses(
+        compare_wrong,
+        &["rooms.r.m4: must be an R² from -1000000 to 1"],
+    );
 }
 
 /// Oracle: every output is whole JSON, or the command is refused.

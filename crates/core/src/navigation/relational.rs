@@ -19,7 +19,7 @@ use crate::room::FrameId;
 /// `seese3 evaluate --shortlist` gives the hits by this number; docs/relational.md has them.
 pub const SHORTLIST: usize = 1_024;
 
-/// The views of a room for relational navigation.
+/// What the retrieval of a room's frames by the relational reader needs.
 #[derive(Clone, Copy)]
 pub struct RelationalSpace<'a> {
     /// The adapter, for the shortlist.
@@ -59,10 +59,10 @@ impl RelationalSpace<'_> {
         let step = self
             .adapter
             .step(view.latent.view(), *motion, Reading::Homogeneous, 1.0);
-        let imagined = view.latent + &step;
+        let predicted = view.latent + &step;
         let shortlist = self
             .search
-            .nearest(imagined.view(), self.shortlist.max(k), exclusion);
+            .nearest(predicted.view(), self.shortlist.max(k), exclusion);
 
         let rows: Vec<usize> = shortlist
             .iter()
@@ -198,10 +198,10 @@ pub fn relational_walk(
     Ok(found)
 }
 
-/// The data of [`relational_walk`].
+/// The arguments of [`relational_walk`].
 #[derive(Clone, Copy)]
 pub struct RelationalWalk<'a> {
-    /// The room's views.
+    /// What retrieval needs.
     pub space: RelationalSpace<'a>,
     /// Latents of all frames, shape (n, k).
     pub latents: ndarray::ArrayView2<'a, f64>,

@@ -204,7 +204,7 @@ impl FeatureMetrics {
                 let (range, words) = match name {
                     "m1" => (0.0..=1.0, "from 0 to 1"),
                     "m2_twonn" | "m2_mle" => (0.0..=MOST, "from 0 to 1000000"),
-                    _ => (-MOST..=1.0, "an R² of at most 1"),
+                    _ => (-MOST..=1.0, "an R² from -1000000 to 1"),
                 };
                 if !range.contains(&value) {
                     let place = format!("{}.{name}", place(&room.room));

@@ -27,19 +27,19 @@ const BENCHMARK_FORMAT: &str = "seese3 benchmark 1";
 /// The format of a submission file.
 const SUBMISSION_FORMAT: &str = "seese3 submission 1";
 
-/// Largest number of letters of a name or an `about` text.
-const MOST_LETTERS: usize = 500;
+/// Largest number of characters of a name or an `about` text.
+const MOST_CHARACTERS: usize = 500;
 
 /// The name of the submission that stands still.
 const IDENTITY: &str = "identity";
 
-/// Why a benchmark or a submission is invalid. Each message names the field and what to change.
+/// Why a benchmark or a submission is invalid. Each message names the field.
 #[derive(Debug, thiserror::Error, PartialEq)]
 #[error("{place}: {problem}")]
 pub struct Error {
     /// The field, for example `frames.studio7-0000[3]`.
     pub place: String,
-    /// What is wrong with it, and what to change.
+    /// What is wrong with it.
     pub problem: String,
 }
 
@@ -531,7 +531,7 @@ fn check_text(place: &str, text: &str) -> Result<(), Error> {
     if text.trim() != text {
         return Err(Error::new(place, "must not begin or end with a blank"));
     }
-    // Letters that the eye does not see, and letters that mean something in Markdown and LaTeX.
+    // Invisible characters, and characters that mean something in Markdown and LaTeX.
     let is_hidden = |c: char| {
         matches!(c, '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}')
             || matches!(c, '\u{2060}'..='\u{206f}' | '\u{feff}')
@@ -542,13 +542,13 @@ fn check_text(place: &str, text: &str) -> Result<(), Error> {
         .any(|c| c.is_control() || is_hidden(c) || is_markup(c))
     {
         let problem =
-            "must be one line without invisible letters and without | < > ` [ ] * \\ ^ ~ and &";
+            "must be one line without invisible characters and without | < > ` [ ] * \\ ^ ~ and &";
         return Err(Error::new(place, problem));
     }
-    if text.chars().count() > MOST_LETTERS {
+    if text.chars().count() > MOST_CHARACTERS {
         return Err(Error::new(
             place,
-            format!("must have at most {MOST_LETTERS} letters"),
+            format!("must have at most {MOST_CHARACTERS} characters"),
         ));
     }
     Ok(())

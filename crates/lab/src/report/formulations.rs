@@ -2,7 +2,7 @@
 //! A.5).
 
 use super::table::Table;
-use crate::experiments::formulations::Comparison;
+use crate::experiments::formulations::{Comparison, FormulationScores};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::statistics::{deviation, mean_of_known};
 
@@ -18,18 +18,24 @@ pub(super) const PARTS: [fn(&MotionScores) -> f64; 4] = [
 /// deviation of the overall R². The last line is the constant baseline.
 pub fn formulations_table(comparison: &Comparison) -> Table {
     let mut table = Table::new("formulation | overall | transl. | rotation | direct. | magnit.");
-    add_formulations(&mut table, comparison, 3);
+    add_formulations(&mut table, comparison, 3, |_| None);
     table
 }
 
-/// Adds the rows of [`formulations_table`] to a table with other titles.
-pub fn add_formulations(table: &mut Table, comparison: &Comparison, decimals: usize) {
+/// Adds the rows of [`formulations_table`] to a table with other titles, with one more cell of each formulation.
+pub fn add_formulations(
+    table: &mut Table,
+    comparison: &Comparison,
+    decimals: usize,
+    last: impl Fn(&FormulationScores) -> Option<String>,
+) {
     for score in &comparison.formulations {
         // One value per seed, already averaged over the rooms.
         let column = |of: fn(&MotionScores) -> f64| score.runs.iter().map(of).collect::<Vec<f64>>();
         let parts = PARTS.map(|of| format!("{:.decimals$}", mean_of_known(&column(of))));
         let overall = spread_text(&column(|run| run.overall), decimals);
-        table.row(score.name, std::iter::once(overall).chain(parts));
+        let cells = std::iter::once(overall).chain(parts);
+        table.row(score.name, cells.chain(last(score)));
     }
 
     let constant = format!("{:.decimals$}", comparison.constant_r2);

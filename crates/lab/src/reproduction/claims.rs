@@ -229,7 +229,7 @@ pub enum Verdict {
     /// Some cases are decided, but not all, or they disagree.
     Mixed,
     /// No case is decided.
-    CannotTell,
+    Open,
     /// There is no case to test the claim on.
     Untested,
 }
@@ -240,7 +240,7 @@ impl Verdict {
         Self::Confirmed,
         Self::Contradicted,
         Self::Mixed,
-        Self::CannotTell,
+        Self::Open,
         Self::Untested,
     ];
 
@@ -250,7 +250,7 @@ impl Verdict {
         if cases.is_empty() {
             Self::Untested
         } else if all_are(None) {
-            Self::CannotTell
+            Self::Open
         } else if all_are(Some(true)) {
             Self::Confirmed
         } else if all_are(Some(false)) {
@@ -265,7 +265,7 @@ impl Verdict {
             Self::Confirmed => "confirmed",
             Self::Contradicted => "contradicted",
             Self::Mixed => "mixed",
-            Self::CannotTell => "cannot be told here",
+            Self::Open => "open",
             Self::Untested => "not tested",
         }
     }
@@ -303,7 +303,7 @@ pub fn section(claims: &[Claim]) -> Section {
     let columns: [Column<(usize, &Claim)>; 5] = [
         Text("claim", |(_, claim)| claim.claim.clone()),
         Text("here", |(_, claim)| claim.verdict.word().to_owned()),
-        Text("decided", |(_, claim)| counts(claim)),
+        Text("cases", |(_, claim)| counts(claim)),
         Text("quantity, above 0 if the claim holds", |(_, claim)| {
             claim.tested.clone()
         }),
@@ -318,7 +318,7 @@ pub fn section(claims: &[Claim]) -> Section {
         "The {count} tests. Means over rooms with 95 % intervals, not corrected; p is of the sign-flip test over rooms, or, \
          with several trainings, of Student's t with the spread of rooms and trainings. A case is decided where p, by \
          Holm's correction for all {count} tests, is below {SIGNIFICANCE}. A claim is confirmed if it holds in every case, \
-         contradicted if it fails in every case, and mixed if only some cases are decided or they disagree."
+         contradicted if it fails in every case, open if no case is decided, and mixed otherwise."
     ));
     section.table(tests_table(claims));
     section
@@ -403,7 +403,7 @@ mod tests {
         let verdicts = claims.each_ref().map(|claim| claim.verdict);
         assert_eq!(
             verdicts,
-            [Verdict::Confirmed, Verdict::Mixed, Verdict::CannotTell]
+            [Verdict::Confirmed, Verdict::Mixed, Verdict::Open]
         );
     }
 
@@ -415,7 +415,7 @@ mod tests {
         assert_eq!(word(&[Some(false), Some(false)]), "contradicted");
         assert_eq!(word(&[Some(false), Some(true)]), "mixed");
         assert_eq!(word(&[Some(true), None]), "mixed");
-        assert_eq!(word(&[None, None]), "cannot be told here");
+        assert_eq!(word(&[None, None]), "open");
         assert_eq!(word(&[]), "not tested");
     }
 
@@ -428,7 +428,7 @@ mod tests {
         let mut claims = [claim(vec![one, none, few])];
         judge(&mut claims);
 
-        assert_eq!(claims[0].verdict, Verdict::CannotTell);
+        assert_eq!(claims[0].verdict, Verdict::Open);
         assert!(claims[0].cases.iter().all(|case| case.reason.is_some()));
     }
 

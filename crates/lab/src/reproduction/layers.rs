@@ -13,7 +13,7 @@ use crate::experiments::layers::{LayerProtocol, LayerScores, score_layer};
 use crate::probes::MutualKnn;
 use crate::report::{Section, Table, fixed, room_difference_text};
 
-/// The single-adapter rooms with the features of one layer.
+/// The in-room rooms with the features of one layer.
 pub struct LayerSet<'a> {
     /// The name of the features.
     pub features: String,

@@ -84,7 +84,7 @@ pub struct Reproduction<'a> {
     pub options: Options,
     /// One entry per feature set, the control last; each has the same rooms.
     pub sets: Vec<FeatureSet<'a>>,
-    /// Layers of an encoder to compare, in the rooms that are learned alone.
+    /// Layers of an encoder to compare, in the in-room rooms.
     pub layers: Vec<LayerSet<'a>>,
     /// Reads images for the pictures of walks; this crate reads no files.
     pub images: Images<'a>,
@@ -286,7 +286,7 @@ fn check_pairs(
     Ok(())
 }
 
-/// The names of the single-room adapters, and the longest name of the other adapters. They allow
+/// The names of the in-room adapters, and the longest name of the other adapters. They allow
 /// checking names before hours of training.
 pub fn adapter_names(given: &Reproduction<'_>) -> Vec<String> {
     let mut names = Vec::new();
@@ -455,7 +455,7 @@ impl Reproduction<'_> {
         plan
     }
 
-    /// The training length of single-room adapters, in words.
+    /// The training length of in-room adapters, in words.
     fn training_words(&self) -> String {
         match self.options.epochs {
             Some(epochs) => format!("Preset base, cut to {epochs} epochs."),
@@ -549,9 +549,9 @@ fn feature_table(sets: &[FeatureSet<'_>]) -> Table {
 fn published(adapters: &Adapters) -> Section {
     let mut section = Section::new("Adapters");
     section.text(format!(
-        "The {} adapters of the tables of navigation are in the store, named \"reproduced.\" and what they learned from: \
-         evaluate, navigate and serve take them. The record has their revisions, seeds and protocols; the other tables' \
-         adapters are what `seese3 train` gives for the same room, preset and seed.",
+        "The store has the {} adapters of the navigation tables as `reproduced.ROOM.FEATURES` and \
+         `reproduced.PLAN.FEATURES`. The record has their revisions, seeds and protocols. `seese3 train` makes the adapters of \
+         the other tables, with the same room, preset and seed.",
         adapters.0.len()
     ));
 

@@ -16,6 +16,7 @@ use seese3_core::training::{RoomData, train_adapter};
 
 use super::adapters::{Adapters, ReproducedAdapter};
 use super::claims::{Case, Claim, encoders_and_control};
+use super::cross::AFFINE;
 use super::{Error, Found, Reproduction, paper};
 use crate::report::{Figure, Section, Series, Table, fixed, room_mean_text};
 
@@ -32,8 +33,8 @@ pub struct NavigationRecord {
     top1: f64,
     /// One hit rate per threshold ε.
     hits: Vec<f64>,
-    /// The first of them with its interval over rooms.
-    hit: RoomMean,
+    /// That of the first threshold, with its interval over rooms.
+    first_hit: RoomMean,
     /// The adapters' names in the store, one per room.
     adapters: Vec<String>,
     /// Numbers of pairs, one per room.
@@ -103,17 +104,19 @@ pub fn section(
 
 /// One row per navigator, then the paper's rows, which have the same columns.
 fn table(thresholds: &[f64], rows: &[NavigationRecord]) -> Table {
-    let hits = thresholds.iter().map(|epsilon| format!(" | Hit@{epsilon}"));
+    let interval = [" [95 %]"].into_iter().chain(std::iter::repeat(""));
+    let hits = thresholds.iter().zip(interval);
+    let titles = hits.map(|(epsilon, interval)| format!(" | Hit@{epsilon}{interval}"));
     let mut table = Table::new(&format!(
         "navigator | MSE | R² | Top-1{}",
-        hits.collect::<String>()
+        titles.collect::<String>()
     ));
 
     for row in rows {
         let hits = row.hits[1..].iter().map(|hit| format!("{hit:.3}"));
         let cells = fixed([row.mse, row.r2, row.top1], 3)
             .into_iter()
-            .chain([room_mean_text(&row.hit)])
+            .chain([room_mean_text(&row.first_hit)])
             .chain(hits);
         table.row(&row.navigator, cells);
     }
@@ -127,7 +130,7 @@ fn table(thresholds: &[f64], rows: &[NavigationRecord]) -> Table {
 /// Hit@ε of a selection of the navigators.
 fn curves(features: &str, thresholds: &[f64], rows: &[NavigationRecord]) -> Figure {
     let is_shown = |row: &&NavigationRecord| {
-        ["identity", "oracle", "inverse-poincare-affine"].contains(&row.navigator.as_str())
+        ["identity", "oracle", AFFINE].contains(&row.navigator.as_str())
             || row.navigator.starts_with("corrector")
             || row.navigator.ends_with("+motion")
     };
@@ -200,7 +203,7 @@ impl Navigated<'_> {
                 .collect()
         };
 
-        let inverse = hit_rates("inverse-poincare-affine");
+        let inverse = hit_rates(AFFINE);
         CorrectorKind::ALL.map(|kind| {
             let corrector = hit_rates(&format!("corrector-{}", kind.name()));
             let case = format!("{}, over {}", self.features, kind.name());
@@ -230,7 +233,7 @@ impl Navigated<'_> {
             hits: (0..first.protocol.thresholds.len())
                 .map(|epsilon| mean(&hits(epsilon)))
                 .collect(),
-            hit: bootstrap_mean(&hits(0), 0),
+            first_hit: bootstrap_mean(&hits(0), 0),
             adapters: self.adapters.clone(),
             n: self.reports.iter().map(|report| report.n).collect(),
         }

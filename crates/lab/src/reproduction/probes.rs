@@ -1,4 +1,4 @@
-//! Section: probes M1 to M3 of the single-adapter rooms and of the held-out rooms.
+//! Section: probes M1 to M3 of the in-room rooms and of the held-out rooms.
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -65,9 +65,9 @@ pub fn section(given: &Reproduction<'_>) -> Result<Found<Vec<ProbeRecord>>, Erro
     let mut section = Section::new("Probes: M1, M2, M3");
     section.table(table(given, &by_set));
     section.text(format!(
-        "M1: at most {} frames, k 10, 10 of them to each side left out; short is the first frames, long is the smallest \
-         stride at which they span the recording. M2: no gap, as in the paper. M3 and always answering the mean training \
-         motion: stride {}, the pairs of all five folds together.",
+        "M1: at most {} frames, k = 10; the 10 frames before and after a frame are no neighbors of it. Short: consecutive \
+         frames. Long: the smallest stride at which the frames span the recording. M2: no gap, as in the paper. M3, and as \
+         'constant' the mean training motion: stride {}, five folds scored together.",
         MutualKnn::default().frames,
         given.options.stride
     ));
@@ -100,7 +100,7 @@ pub fn section(given: &Reproduction<'_>) -> Result<Found<Vec<ProbeRecord>>, Erro
     })
 }
 
-/// One row per single-adapter room, and one for the held-out rooms together; the paper's rows
+/// One row per in-room room, and one for the held-out rooms together; the paper's rows
 /// follow.
 fn table(given: &Reproduction<'_>, by_set: &[Vec<ProbeRecord>]) -> Table {
     let mut table = Table::new(

@@ -180,7 +180,7 @@ fn base_plan(given: &Reproduction<'_>, seed: u64) -> TrainingPlan {
     )
 }
 
-/// The scores of each single-adapter room.
+/// The scores of each in-room room.
 fn scores(set: &FeatureSet<'_>, plan: &TrainingPlan) -> Result<Vec<MotionScores>, Error> {
     let of_room = |room: &RoomData<'_>| {
         let read = FoldedMotions::of(&[Split::Blocks], |split| {

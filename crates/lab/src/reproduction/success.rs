@@ -56,8 +56,8 @@ pub fn section(given: &Reproduction<'_>) -> Result<Found<Vec<SweepRow>>, Error> 
     );
     section.table(pairs_table(&rows));
     section.text(
-        "Difficulty by image contrast, over all features: thirds of the rooms by the median over frames of the standard \
-         deviation of the control's columns (of pixels: of an image's brightness):",
+        "Difficulty by contrast, over all features. The contrast of a room is the median over frames of the standard \
+         deviation of a frame's control feature (for pixels: over cells and color channels). Thirds of the rooms:",
     );
     section.table(contrast_table(given, &rows));
     section.text("By charts (K), mean over rooms and strides:");

@@ -7,9 +7,9 @@ use serde::Serialize;
 use seese3_core::adapter::Reading;
 use seese3_core::eval::{Protocol, RetrievedPair};
 use seese3_core::geometry::body_twist;
-use seese3_core::navigation::{Mode, NavigatorKind, RetrievalMetric, StepKind};
+use seese3_core::navigation::{HIT_THRESHOLDS, Mode, NavigatorKind, RetrievalMetric, StepKind};
 use seese3_core::splits::Split;
-use seese3_core::statistics::{mean, mean_of_known, median};
+use seese3_core::statistics::{RoomMean, bootstrap_mean, mean, median};
 use seese3_core::training::RoomData;
 
 use super::adapters::Adapters;
@@ -19,7 +19,7 @@ use super::plans::steady_adapter;
 use super::{Error, Found, Reproduction};
 use crate::experiments::cross_room::{RoomOutcome, outcomes};
 use crate::report::Column::{self, Number, Text};
-use crate::report::{Section, Table};
+use crate::report::{Section, Table, room_mean_text};
 
 /// Number of equal steps of a walk, as in the paper.
 const STEPS: u32 = 4;
@@ -38,10 +38,12 @@ pub struct WalkEndRecord {
     most: Option<f64>,
     rooms: usize,
     pairs: usize,
-    /// Share of walks that end within 0.1 of the target, mean over rooms.
-    hit: f64,
-    /// Mean over rooms of the mean distance ‖ΔP_target − ΔP_end‖.
-    error: f64,
+    /// Share of walks that end within 0.1 of the target.
+    hit: RoomMean,
+    /// The same of standing still, mean over rooms.
+    still_hit: f64,
+    /// The mean distance ‖ΔP_target − ΔP_end‖.
+    error: RoomMean,
     /// The same of standing still.
     still_error: f64,
     /// Median over rooms of the median distance, meters and degrees.
@@ -78,7 +80,7 @@ pub fn section(
     }
 
     let record: Vec<WalkEndRecord> = walks.iter().flat_map(Walks::records).collect();
-    let columns: [Column<WalkEndRecord>; 11] = [
+    let columns: [Column<WalkEndRecord>; 12] = [
         Text("features", |row| row.features.clone()),
         Text("mode", |row| row.mode.to_owned()),
         Text("size of the motion", |row| {
@@ -86,13 +88,14 @@ pub fn section(
         }),
         Text("rooms", |row| row.rooms.to_string()),
         Text("pairs", |row| row.pairs.to_string()),
-        Number("Hit@0.1", 3, |row| row.hit),
-        Number("end error", 3, |row| row.error),
-        Number("standing still", 3, |row| row.still_error),
+        Text("Hit@0.1 [95 %]", |row| room_mean_text(&row.hit)),
+        Number("Identity", 3, |row| row.still_hit),
+        Text("end error [95 %]", |row| room_mean_text(&row.error)),
+        Number("of Identity", 3, |row| row.still_error),
         Number("end, m", 2, |row| row.meters),
         Number("end, °", 1, |row| row.degrees),
-        Text("end error / standing still", |row| {
-            format!("{:.2}", row.error / row.still_error)
+        Text("end error / of Identity", |row| {
+            format!("{:.2}", row.error.mean / row.still_error)
         }),
     ];
     let mut section = Section::new("Walks of four steps in held-out rooms, by size of the motion");
@@ -100,8 +103,8 @@ pub fn section(
     section.text(format!(
         "Adapters of preset steady on all training rooms. Every pair of every held-out room at strides {:?}, \
          {STEPS} equal steps by {HOMOGENEOUS}, all frames are candidates. The size of a motion is ‖ΔP‖, the end error \
-         ‖ΔP − ΔP of the last frame‖, meters and radians together; standing still has the size as its error. Means over \
-         rooms; meters and degrees are medians. Open loop is the paper's mode and ends where one step ends (A-22); snap \
+         ‖ΔP − ΔP of the last frame‖, meters and radians together; Identity stays at the source, and its error is the size. Means over rooms with 95 % \
+         intervals; meters and degrees are medians. Open loop is the paper's mode and ends where one step ends (A-22); snap \
          takes each step from the frame that the last one retrieved.",
         given.options.strides
     ));
@@ -137,7 +140,7 @@ fn walked(
     for &stride in &given.options.strides {
         let protocol = Protocol {
             split: Split::Whole,
-            thresholds: vec![0.1],
+            thresholds: vec![HIT_THRESHOLDS[0]],
             navigators: vec![NavigatorKind::Step(step, RetrievalMetric::Full)],
             steps: STEPS,
             mode,
@@ -213,6 +216,11 @@ impl Walks {
                 let known: Vec<f64> = medians.into_iter().filter(|x| !x.is_nan()).collect();
                 median(&known)
             };
+            let over_rooms = |of: fn(&End) -> f64| {
+                let mut means = values(&|ends| mean(&each(ends, of)));
+                means.retain(|mean| !mean.is_nan());
+                bootstrap_mean(&means, 0)
+            };
             WalkEndRecord {
                 features: self.features.clone(),
                 mode: self.mode.name(),
@@ -220,11 +228,10 @@ impl Walks {
                 most: Some(class.1).filter(|most| most.is_finite()),
                 rooms: known.len(),
                 pairs: known.iter().sum::<f64>() as usize,
-                hit: mean_of_known(&values(&|ends| {
-                    mean(&each(ends, |end| f64::from(u8::from(end.error < 0.1))))
-                })),
-                error: mean_of_known(&values(&|ends| mean(&each(ends, |end| end.error)))),
-                still_error: mean_of_known(&values(&|ends| mean(&each(ends, |end| end.size)))),
+                hit: over_rooms(|end| is_hit(end.error)),
+                still_hit: over_rooms(|end| is_hit(end.size)).mean,
+                error: over_rooms(|end| end.error),
+                still_error: over_rooms(|end| end.size).mean,
                 meters: middle(|end| end.meters),
                 degrees: middle(|end| end.radians).to_degrees(),
             }
@@ -232,6 +239,11 @@ impl Walks {
         let records = classes().map(record);
         records.filter(|record| record.rooms > 0).collect()
     }
+}
+
+/// 1 for an error within the smallest threshold of the paper, else 0.
+fn is_hit(error: f64) -> f64 {
+    f64::from(u8::from(error < HIT_THRESHOLDS[0]))
 }
 
 fn each(ends: &[&End], of: fn(&End) -> f64) -> Vec<f64> {
@@ -307,9 +319,10 @@ mod tests {
         let records = walks.records();
         let [small, middle] = [&records[0], &records[1]];
         assert_eq!((small.rooms, small.pairs), (2, 3));
-        assert!((small.error - 0.2).abs() < 1e-12, "{small:?}");
-        assert!((small.hit - 0.25).abs() < 1e-12, "{small:?}");
+        assert!((small.error.mean - 0.2).abs() < 1e-12, "{small:?}");
+        assert!((small.hit.mean - 0.25).abs() < 1e-12, "{small:?}");
         assert!((small.still_error - 0.2).abs() < 1e-12, "{small:?}");
+        assert_eq!(small.still_hit, 0.0);
         assert_eq!((middle.rooms, middle.pairs, middle.most), (1, 1, Some(0.6)));
         assert_eq!(records.len(), 2, "no walk is larger");
 

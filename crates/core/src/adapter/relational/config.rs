@@ -24,7 +24,7 @@ pub struct RelationalConfig {
     pub learning_rate: f64,
     /// Decoupled weight decay, applied to every parameter.
     pub weight_decay: f64,
-    /// Width of the hidden layer.
+    /// Width of both hidden layers.
     pub hidden: usize,
     /// Standard deviation of the Gaussian noise added to the similarities at every step.
     pub noise: f64,

@@ -10,7 +10,7 @@ use crate::features::Grid;
 /// high one selects the most similar ones.
 pub const INVERSE_TEMPERATURES: [f32; 2] = [8.0, 30.0];
 
-/// Numbers per cell, direction and temperature: displacement across and down, and spread.
+/// Numbers per cell, direction and temperature: displacement across and down, and variance.
 const PER_TEMPERATURE: usize = 3;
 
 /// Layout of the inputs of one pair of images.
@@ -118,16 +118,16 @@ impl PartLayout {
         let cells = similarities
             .outer_iter()
             .zip(out.chunks_exact_mut(per_cell));
-        for (cell, (row, out)) in cells.enumerate() {
+        for (cell, (row, of_cell)) in cells.enumerate() {
             let largest = row.fold(f32::NEG_INFINITY, |a, &b| a.max(b));
-            out[0] = largest;
+            of_cell[0] = largest;
 
             let [own_x, own_y] = self.centers[cell];
-            let moments = out[1..].chunks_exact_mut(PER_TEMPERATURE);
-            for (out, sharpness) in moments.zip(INVERSE_TEMPERATURES) {
+            let moments = of_cell[1..].chunks_exact_mut(PER_TEMPERATURE);
+            for (moments, inverse_temperature) in moments.zip(INVERSE_TEMPERATURES) {
                 let [mut weight, mut x, mut y, mut square] = [0.0f32; 4];
                 for (&similarity, &[cx, cy]) in row.iter().zip(&self.centers) {
-                    let w = (sharpness * (similarity - largest)).exp();
+                    let w = (inverse_temperature * (similarity - largest)).exp();
                     weight += w;
                     x += w * cx;
                     y += w * cy;
@@ -135,9 +135,9 @@ impl PartLayout {
                 }
 
                 let (x, y) = (x / weight, y / weight);
-                out[0] = x - own_x;
-                out[1] = y - own_y;
-                out[2] = square / weight - x * x - y * y;
+                moments[0] = x - own_x;
+                moments[1] = y - own_y;
+                moments[2] = square / weight - x * x - y * y;
             }
         }
     }

@@ -28,7 +28,7 @@ use super::{Error, Network};
 use crate::features::FeatureSource;
 use crate::geometry::Twist;
 use inputs::{InputLayout, of_image};
-use network::{Density, OUTPUTS, UNIT, density, in_units};
+use network::{Density, OUTPUTS, TWIST_SCALE, density, in_units};
 
 /// Maximum number of members of a reader.
 pub const MAX_MEMBERS: usize = 16;
@@ -155,7 +155,7 @@ impl RelationalReader {
     /// measured.
     pub fn motions(&self, from: &Cells, image: usize, to: &Cells) -> Vec<MotionReading> {
         let [linear, angular] = self.error_scale.unwrap_or([1.0, 1.0]);
-        let scale = |i: usize| UNIT[i] * if i < 3 { linear } else { angular };
+        let scale = |i: usize| TWIST_SCALE[i] * if i < 3 { linear } else { angular };
 
         let mut readings = Vec::with_capacity(to.count());
         self.for_each_density(from, image, to, |there, reverse| {
@@ -175,7 +175,7 @@ impl RelationalReader {
             let mean = inverse * weighted;
             let count = (there.len() + reverse.len()) as f64;
             readings.push(MotionReading {
-                twist: Twist::from_vector(&Vector6::from_fn(|i, _| mean[i] * UNIT[i])),
+                twist: Twist::from_vector(&Vector6::from_fn(|i, _| mean[i] * TWIST_SCALE[i])),
                 covariance: Matrix6::from_fn(|i, j| count * inverse[(i, j)] * scale(i) * scale(j)),
             });
         });

@@ -15,19 +15,18 @@ use super::pairs::{DrawnPair, PairSampler};
 use crate::geometry::Twist;
 use crate::statistics::normal_deviates;
 
-/// Outputs: six means, six logarithms of conditional precisions, and 15 couplings. See
-/// [`density`].
+/// Outputs: six means; of the square root R of the information matrix, six logarithms of the
+/// diagonal and 15 scaled entries below it. See [`density`].
 pub const OUTPUTS: usize = 27;
 
-/// Units of the twists in the network: meters for v, radians for ω.
-pub const UNIT: [f64; 6] = [0.3, 0.3, 0.3, 0.4, 0.4, 0.4];
+/// Scale of the twists in the network: meters for v, radians for ω.
+pub const TWIST_SCALE: [f64; 6] = [0.3, 0.3, 0.3, 0.4, 0.4, 0.4];
 
-/// Bounds of the logarithm of a conditional precision's square root, in units of [`UNIT`]: standard
+/// Bounds of the logarithm of a diagonal entry of R, in units of [`TWIST_SCALE`]: conditional standard
 /// deviations of 7 units to 0.05 units.
 const LOG_ROOT: [f64; 2] = [-2.0, 3.0];
 
-/// The factor on the initial weights of precisions and couplings, which starts them near one and
-/// zero.
+/// The factor on the initial weights of the entries of R, which starts R near the identity.
 const INITIAL_FACTOR: f64 = 0.1;
 
 /// PyTorch's names of the tensors of the last layer.
@@ -42,17 +41,17 @@ pub struct RelationalNetwork<T> {
     head: [Array2<T>; 2],
 }
 
-/// A Gaussian density of a twist, in units of [`UNIT`].
+/// A Gaussian density of a twist, in units of [`TWIST_SCALE`].
 ///
-/// With e = y − mean, u = root · e is standard normal; root is lower triangular, and rootᵀ root is
-/// the inverse of the covariance.
+/// With e = y − mean, u = R e is standard normal. R is the square root of the information matrix:
+/// lower triangular, with RᵀR = Σ⁻¹.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Density {
     /// The mean.
     pub mean: [f64; 6],
-    /// The lower triangular root of the inverse covariance, row by row; zeros above the diagonal.
+    /// R, row by row; zeros above the diagonal.
     pub root: [[f64; 6]; 6],
-    /// The logarithm of the root's determinant.
+    /// The logarithm of R's determinant.
     pub log_determinant: f64,
 }
 
@@ -69,8 +68,8 @@ impl Density {
     }
 }
 
-/// The density that a row of [`OUTPUTS`] outputs stands for: means m, logarithms d and couplings c
-/// with root_ii = exp d_i and root_ij = c_ij exp d_i for j < i.
+/// The density of a row of [`OUTPUTS`] outputs: the mean, then d and c with R_ii = exp d_i and
+/// R_ij = c_ij exp d_i for j < i.
 pub fn density<T: Real>(outputs: ArrayView1<'_, T>) -> Density {
     let mut found = Density {
         mean: [0.0; 6],
@@ -208,7 +207,7 @@ impl RelationalSamples {
 
     /// Inputs and targets of `count` pairs, drawn from the seed and the step. Half of the pairs are
     /// mirrored, and all similarities get Gaussian noise of the configured size. Targets are in
-    /// units of [`UNIT`].
+    /// units of [`TWIST_SCALE`].
     fn batch<T: Real>(&self, count: usize, at: At<'_>) -> (Array2<T>, Vec<[f64; 6]>) {
         let mut random = ChaCha8Rng::seed_from_u64(at.config.seed);
         random.set_stream(at.step);
@@ -247,10 +246,10 @@ impl RelationalSamples {
     }
 }
 
-/// A twist in units of [`UNIT`].
+/// A twist in units of [`TWIST_SCALE`].
 pub fn in_units(twist: &Twist) -> [f64; 6] {
     let vector = twist.to_vector();
-    std::array::from_fn(|i| vector[i] / UNIT[i])
+    std::array::from_fn(|i| vector[i] / TWIST_SCALE[i])
 }
 
 /// The motion between two mirrored images: x of v, and y and z of ω change sign.
@@ -272,7 +271,7 @@ impl<T: Real> Objective<T> for RelationalNetwork<T> {
 }
 
 impl<T: Real> RelationalNetwork<T> {
-    /// The mean negative log-likelihood of targets, in units of [`UNIT`], for rows of inputs, and
+    /// The mean negative log-likelihood of targets, in units of [`TWIST_SCALE`], for rows of inputs, and
     /// its gradient.
     fn loss_gradient(&self, inputs: Array2<T>, targets: &[[f64; 6]]) -> (f64, Self) {
         let forward = self.body.forward(&inputs);
