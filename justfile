@@ -69,6 +69,10 @@ e2e:
 bench:
     cargo bench --features full
 
+# The serving path beside what one would use instead, in one run; installs these peers.
+bench-peers *words:
+    benches/peers/run.sh {{words}}
+
 # Makes the expected values of tests/golden again; needs the packages of tests/golden/requirements.txt.
 golden:
     bash tests/golden/make_all.sh python3

@@ -1,5 +1,4 @@
-//! Baselines of the hot paths: one answer by room size, the indexes' scans, a training epoch, one
-//! RPC.
+//! Baselines of the hot paths: one answer by room size, the indexes' scans, a training epoch.
 //!
 //! No targets: each group has a simpler peer beside it, so that what is read is a ratio of the same
 //! run.
@@ -13,13 +12,10 @@
 
 use std::hint::black_box;
 use std::sync::Arc;
-use std::time::Duration;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use ndarray::Array2;
 use rand::{RngExt, SeedableRng};
-use seese3_client::Client;
-use seese3_client::proto::v1 as pb;
 use seese3_core::adapter::{Adapter, Mixture, Samples, Siamese, TrainConfig, Trainer, Widths};
 use seese3_core::cancel::Cancellation;
 use seese3_core::features::{FeatureSource, Features};
@@ -50,16 +46,20 @@ fn trajectory(rows: usize) -> Array2<f64> {
 }
 
 fn room(frame_count: usize) -> (Arc<Room>, Features) {
-    let step = exp(&Twist {
-        linear: [0.01, 0.0, 0.02].into(),
-        angular: [0.0, 0.01, 0.0].into(),
-    });
-    let poses = std::iter::successors(Some(nalgebra::Isometry3::identity()), |pose| {
-        Some(pose * step)
+    let wave = |t: usize, axis: usize| 0.02 * (t as f64 / (9.0 + 3.0 * axis as f64)).sin();
+    let step = |t: usize| {
+        exp(&Twist {
+            linear: nalgebra::Vector3::from_fn(|axis, _| wave(t, axis)),
+            angular: nalgebra::Vector3::from_fn(|axis, _| wave(t, 3 + axis)),
+        })
+    };
+    let poses = (0..frame_count).scan(nalgebra::Isometry3::identity(), |pose, t| {
+        *pose *= step(t);
+        Some(*pose)
     });
 
     let frames = Frames {
-        poses: poses.take(frame_count).collect(),
+        poses: poses.collect(),
         ..Frames::default()
     };
     let room = Room::new(RoomId::new("bench").unwrap(), frames, Provenance::default()).unwrap();
@@ -69,15 +69,6 @@ fn room(frame_count: usize) -> (Arc<Room>, Features) {
         Arc::new(room),
         Features::new(FeatureSource::imported("bench", DIM), rows).unwrap(),
     )
-}
-
-fn twists(count: usize) -> Vec<Twist> {
-    let numbers = random(count, 6, 2);
-    let row = |row: ndarray::ArrayView1<'_, f64>| {
-        Twist::from_vector(&nalgebra::Vector6::from_fn(|i, _| row[i]))
-    };
-
-    numbers.outer_iter().map(row).collect()
 }
 
 fn adapter() -> Arc<Adapter> {
@@ -295,93 +286,5 @@ fn epoch(criterion: &mut Criterion) {
     group.finish();
 }
 
-/// One Navigate over loopback; the peer is the health check, the least that a call can cost.
-fn rpc(criterion: &mut Criterion) {
-    let runtime = tokio::runtime::Runtime::new().unwrap();
-    let folder = tempfile::tempdir().unwrap();
-    let client = runtime.block_on(serve(folder.path().to_str().unwrap()));
-
-    let request = pb::NavigateRequest {
-        room: "bench".to_owned(),
-        source: Some(pb::View {
-            view: Some(pb::view::View::FrameId(7)),
-        }),
-        motion: Some(pb::RequestedMotion {
-            motion: Some(pb::requested_motion::Motion::TargetFrameId(47)),
-        }),
-        steps: Some(4),
-        ..pb::NavigateRequest::default()
-    };
-
-    let mut group = criterion.benchmark_group("rpc");
-    group.bench_function("navigate", |bencher| {
-        bencher.iter(|| {
-            runtime
-                .block_on(client.0.navigate(request.clone()))
-                .unwrap()
-        });
-    });
-
-    group.bench_function("health-check", |bencher| {
-        let mut health = tonic_health::pb::health_client::HealthClient::new(client.1.clone());
-        let request = tonic_health::pb::HealthCheckRequest {
-            service: String::new(),
-        };
-        bencher.iter(|| runtime.block_on(health.check(request.clone())).unwrap());
-    });
-
-    group.finish();
-}
-
-async fn serve(folder: &str) -> (Client, tonic::transport::Channel) {
-    let store = seese3_store::Store::create(folder).unwrap();
-    let (room, features) = room(1_000);
-    store
-        .publish_room(&room, std::slice::from_ref(&features))
-        .await
-        .unwrap();
-
-    let record = seese3_core::adapter::TrainingRecord {
-        preset: "bench".to_owned(),
-        split: seese3_core::splits::Split::Time,
-        stride: 40,
-        pairs: seese3_core::adapter::PairPlan::Stride(40),
-        rooms: vec![(room.id().clone(), 1)],
-        calibrated_on: Vec::new(),
-        config: TrainConfig::default(),
-        pair_count: 100,
-        room_tests: Vec::new(),
-        test: seese3_core::motion_scores::MotionScores::of(&twists(9), &twists(9)),
-        train: seese3_core::motion_scores::MotionScores::of(&twists(9), &twists(9)),
-        train_mean_r2: 0.0,
-        relational: None,
-    };
-
-    store
-        .publish_adapter("bench", &adapter(), &record, features.rows())
-        .await
-        .unwrap();
-
-    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
-    let address = listener.local_addr().unwrap().to_string();
-
-    tokio::spawn(seese3_server::run(
-        listener,
-        store,
-        seese3_server::Config::default(),
-        std::future::pending(),
-    ));
-
-    let client = Client::connect(&address, Duration::from_secs(10))
-        .await
-        .unwrap();
-    while client.rooms().await.is_err() {
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
-
-    let endpoint = tonic::transport::Endpoint::from_shared(format!("http://{address}")).unwrap();
-    (client, endpoint.connect().await.unwrap())
-}
-
-criterion_group!(benches, one_answer, relational, scan, epoch, rpc);
+criterion_group!(benches, one_answer, relational, scan, epoch);
 criterion_main!(benches);

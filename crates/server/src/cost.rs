@@ -6,11 +6,15 @@ use super::Error;
 use super::snapshot::Snapshot;
 use super::workers::{Lane, image_count, images_of};
 use seese3_client::proto::v1 as pb;
-use seese3_core::navigation::{IndexKind, Limits};
+use seese3_core::navigation::{IndexKind, Limits, NavigatorKind, RetrievalMetric, StepKind};
 use seese3_core::room::Room;
 
 /// Cost limit of the lane for short requests, comparisons: about 10 ms.
 const SHORT: f64 = 1e6;
+/// Cost limit of work that is done in place, products of coordinates: about 0.1 ms.
+const BRIEF: f64 = 4e6;
+/// Products that take as long as choosing a frame among the nearest.
+const CHOICE: usize = 20;
 /// Maximum number of images of a request in the lane for images: a stereo pair.
 const IMAGES: usize = 2;
 /// Maximum number of rooms in whose keypoints an image is searched in the lane for images.
@@ -27,7 +31,19 @@ impl Costs<'_> {
     pub fn navigate(&self, request: &pb::NavigateRequest) -> Lane {
         let images = image_count(&request.source);
         let steps = step_count(request) as f64;
-        lane(images, steps * self.comparisons(&request.room))
+        match lane(images, steps * self.comparisons(&request.room)) {
+            Lane::Short if is_prepared(request) => self.brief(&request.room, steps),
+            lane => lane,
+        }
+    }
+
+    /// Lane of `views` views that are compared with the frames of a room, as latents.
+    pub fn brief(&self, room: &str, views: f64) -> Lane {
+        let room = self.snapshot.rooms().get(room);
+        let Some(room) = room.filter(|_| self.index == IndexKind::Exact) else {
+            return Lane::Short;
+        };
+        brief_or_short(views * products(room.widest_latent(), room.summary.frame_count))
     }
 
     /// Lane of a Localize or Relocalize request.
@@ -81,6 +97,36 @@ impl Costs<'_> {
         let room = self.snapshot.rooms().get(room);
         room.map_or(0, |room| room.summary.frame_count)
     }
+}
+
+/// Products of coordinates when a view is compared with this many frames, to find the nearest.
+pub fn products(coordinates: usize, frame_count: usize) -> f64 {
+    (coordinates + CHOICE) as f64 * frame_count as f64
+}
+
+/// Lane of work without images, of this many products of coordinates.
+pub fn brief_or_short(products: f64) -> Lane {
+    if products <= BRIEF {
+        Lane::Brief
+    } else {
+        Lane::Short
+    }
+}
+
+/// Whether a request needs only what is prepared when a room is loaded. A refit is fitted at its first request,
+/// some metrics are prepared then, and the relational reader takes milliseconds.
+fn is_prepared(request: &pb::NavigateRequest) -> bool {
+    let is_prepared = |navigator| {
+        matches!(
+            navigator,
+            NavigatorKind::Step(
+                StepKind::InversePoincare(_) | StepKind::Corrector(_),
+                RetrievalMetric::Full
+            )
+        )
+    };
+    request.navigator.is_empty()
+        || NavigatorKind::from_name(&request.navigator).is_some_and(is_prepared)
 }
 
 /// Lane of a request with images to decode and comparisons.
@@ -221,5 +267,9 @@ mod tests {
         assert_eq!(lane(0, 20_000.0 * 1_000.0), Lane::Long);
         assert_eq!(lane(2, 20_000.0), Lane::Images);
         assert_eq!(lane(3, 20_000.0), Lane::Long);
+
+        // Four latents of 20 numbers among 5,000 frames, and among 30,000.
+        assert_eq!(brief_or_short(4.0 * products(20, 5_000)), Lane::Brief);
+        assert_eq!(brief_or_short(4.0 * products(20, 30_000)), Lane::Short);
     }
 }

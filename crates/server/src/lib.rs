@@ -2,7 +2,8 @@
 //!
 //! - A request is answered from the [`Snapshot`] that was current when it began. Snapshots are
 //!   immutable; when the store changes, a new one replaces the old.
-//! - Computation runs on a bounded number of blocking threads. A panic fails only its request.
+//! - Computation runs on a bounded number of blocking threads, or in place if it takes about a tenth
+//!   of a millisecond. A panic fails only its request.
 //! - Long work regularly checks for cancellation: it stops after the deadline, or when the caller
 //!   has gone.
 //!
@@ -97,7 +98,7 @@ use catalog::Changes;
 use connections::Acceptance;
 use cost::Costs;
 use health::RoomHealth;
-use memory::{Memory, MemoryLayer, respond, with_lease};
+use memory::{Memory, MemoryLayer, Responses, respond, with_lease};
 use reload::ReloadHandle;
 use request_metrics::RequestMetricsLayer;
 use seese3_client::proto::FILE_DESCRIPTOR_SET;
@@ -516,7 +517,7 @@ fn memory_layer(config: &Config) -> MemoryLayer {
         memory,
         message_bytes: config.message_bytes,
         receive_within: config.receive_within,
-        response_timeout: config.response_timeout,
+        responses: Responses::watched(config.response_timeout),
         watchers: Memory::new(config.memory_bytes / WATCHERS, config.metrics.clone()),
     }
 }

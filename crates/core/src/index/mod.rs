@@ -4,6 +4,7 @@
 //! Contract of every index (`tests/index_contract.rs`): results are ordered by L2 distance, then by
 //! frame; excluded frames are never returned; fewer than `k` are returned only when fewer remain.
 
+mod scores;
 mod exact;
 #[cfg(feature = "hnsw")]
 mod hnsw;
@@ -65,6 +66,17 @@ impl Exclusion {
 pub trait Index: Send + Sync {
     /// The `k` nearest frames to `query`, ordered by distance, then by frame.
     fn nearest(&self, query: &[f64], k: usize, exclusion: Option<Exclusion>) -> Vec<Neighbor>;
+
+    /// The answers of [`Index::nearest`] to several queries, in their order.
+    fn nearest_of_each(
+        &self,
+        queries: &[&[f64]],
+        k: usize,
+        exclusion: Option<Exclusion>,
+    ) -> Vec<Vec<Neighbor>> {
+        let nearest = |query: &&[f64]| self.nearest(query, k, exclusion);
+        queries.iter().map(nearest).collect()
+    }
 
     /// Number of indexed frames.
     fn len(&self) -> usize;

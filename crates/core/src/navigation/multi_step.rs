@@ -10,6 +10,9 @@ use crate::geometry::{Pose, Twist, body_twist};
 use crate::index::{Exclusion, Neighbor};
 use crate::room::FrameId;
 
+/// Steps of an open loop whose frames are retrieved between two checks for cancellation.
+const TOGETHER: usize = 16;
+
 /// How the steps of one motion are chained.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, EnumMessage, EnumString, IntoStaticStr, VariantArray,
@@ -134,56 +137,111 @@ pub fn walk(
     plan: Plan,
     cancel: &Cancellation,
 ) -> Result<Vec<Step>, Error> {
-    // Only a closed loop uses poses. The other modes ignore the goal and take equal parts of the
-    // motion.
-    let goal = match (plan.mode, leg.goal) {
-        (Mode::ClosedLoop, None) => {
-            return Err(Error::PoseNeeded {
-                what: "a closed loop",
-            });
-        }
-        (Mode::ClosedLoop, goal) => goal,
-        _ => None,
-    };
+    match (plan.mode, leg.goal) {
+        (Mode::OpenLoop, _) => open_loop(space, start, leg, plan, cancel),
+        (Mode::Snap, _) => with_feedback(space, start, leg, None, plan, cancel),
+        // Only a closed loop uses poses.
+        (Mode::ClosedLoop, None) => Err(Error::PoseNeeded {
+            what: "a closed loop",
+        }),
+        (Mode::ClosedLoop, goal) => with_feedback(space, start, leg, goal, plan, cancel),
+    }
+}
 
+/// Retrieves the frames of all steps together: no step depends on a retrieved frame.
+fn open_loop(
+    space: Space<'_>,
+    start: &Start,
+    leg: Leg,
+    plan: Plan,
+    cancel: &Cancellation,
+) -> Result<Vec<Step>, Error> {
+    let part = leg.motion.divided(plan.steps);
+    let mut latents: Vec<Array1<f64>> = Vec::new();
+    for _ in 0..plan.steps {
+        cancel.check()?;
+        let at = latents.last().unwrap_or(&start.latent);
+        let step = space
+            .stepper
+            .step(space.adapter, at.view(), part, plan.mean_share())?;
+        latents.push(at + &step);
+    }
+
+    let mut steps = Vec::with_capacity(latents.len());
+    for latents in latents.chunks(TOGETHER) {
+        cancel.check()?;
+        let exclusion = plan.exclusion(start.frame);
+        let queries = latents.iter().map(|latent| latent.view());
+        let found = space.search.nearest_of_each(queries, plan.top_k, exclusion);
+        for (latent, neighbors) in latents.iter().zip(found) {
+            steps.push(Step::new(latent.clone(), neighbors, space)?);
+        }
+    }
+    Ok(steps)
+}
+
+/// Each step starts from the frame that the last one retrieved. With a goal, the remaining motion is
+/// planned anew.
+fn with_feedback(
+    space: Space<'_>,
+    start: &Start,
+    leg: Leg,
+    goal: Option<Pose>,
+    plan: Plan,
+    cancel: &Cancellation,
+) -> Result<Vec<Step>, Error> {
     let mut at = start.clone();
     let mut steps = Vec::new();
     for done in 0..plan.steps {
         cancel.check()?;
 
-        // A closed loop divides the remaining motion by the remaining steps; the other modes always
-        // take the same part of the whole motion.
+        // A closed loop divides the remaining motion by the remaining steps; snap always takes the
+        // same part of the whole motion.
         let (remaining, steps_left) = match (goal, at.pose) {
             (Some(goal), Some(pose)) => (body_twist(&pose, &goal), plan.steps - done),
             _ => (leg.motion, plan.steps),
         };
-
-        // The fraction of μ, or of a refit's intercept, in this step; the fractions of all steps
-        // add up to 1.
-        let mean_share = f64::from(plan.steps).recip();
         let step = space.stepper.step(
             space.adapter,
             at.latent.view(),
             remaining.divided(steps_left),
-            mean_share,
+            plan.mean_share(),
         )?;
         let latent = &at.latent + &step;
 
-        let exclusion = plan
-            .exclude_source
-            .zip(at.frame)
-            .map(|(radius, center)| Exclusion { center, radius });
+        let exclusion = plan.exclusion(at.frame);
         let neighbors = space.search.nearest(latent.view(), plan.top_k, exclusion);
+        let step = Step::new(latent, neighbors, space)?;
 
-        let Some(first) = neighbors.first() else {
-            return Err(Error::NoCandidates {
-                frame_count: space.poses.len(),
-            });
-        };
-
-        at = plan.mode.next_start(&at, &latent, first.frame, space);
-        steps.push(Step { latent, neighbors });
+        at = plan
+            .mode
+            .next_start(&at, &step.latent, step.neighbors[0].frame, space);
+        steps.push(step);
     }
 
     Ok(steps)
+}
+
+impl Plan {
+    /// The fraction of μ, or of a refit's intercept, in one step; the fractions of all steps add up to 1.
+    fn mean_share(&self) -> f64 {
+        f64::from(self.steps).recip()
+    }
+
+    /// The frames that a step from `frame` must not retrieve.
+    fn exclusion(&self, frame: Option<FrameId>) -> Option<Exclusion> {
+        let excluded = self.exclude_source.zip(frame);
+        excluded.map(|(radius, center)| Exclusion { center, radius })
+    }
+}
+
+impl Step {
+    fn new(latent: Array1<f64>, neighbors: Vec<Neighbor>, space: Space<'_>) -> Result<Self, Error> {
+        if neighbors.is_empty() {
+            return Err(Error::NoCandidates {
+                frame_count: space.poses.len(),
+            });
+        }
+        Ok(Self { latent, neighbors })
+    }
 }

@@ -257,6 +257,21 @@ impl Search {
             .nearest(&self.projection.one(latent), k, exclusion)
     }
 
+    /// The `k` frames nearest to each of some latents, as [`Search::nearest`] finds them.
+    pub fn nearest_of_each<'a>(
+        &self,
+        latents: impl IntoIterator<Item = ArrayView1<'a, f64>>,
+        k: usize,
+        exclusion: Option<Exclusion>,
+    ) -> Vec<Vec<Neighbor>> {
+        let projected = latents
+            .into_iter()
+            .map(|latent| self.projection.one(latent));
+        let projected: Vec<Vec<f64>> = projected.collect();
+        let queries: Vec<&[f64]> = projected.iter().map(Vec::as_slice).collect();
+        self.index.nearest_of_each(&queries, k, exclusion)
+    }
+
     /// Approximate memory use, bytes.
     pub fn memory_bytes(&self) -> usize {
         self.index.memory_bytes()

@@ -1,8 +1,9 @@
 //! What every index promises, checked for each.
 
 use ndarray::Array2;
+use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
-use seese3_core::index::{ExactIndex, Exclusion, Index};
+use seese3_core::index::{ExactIndex, Exclusion, Index, distance};
 #[cfg(feature = "hnsw")]
 use seese3_core::index::{HnswIndex, HnswParameters};
 use seese3_core::room::FrameId;
@@ -137,6 +138,70 @@ fn contract(build: Build, least_recall: f64) {
         for (k, (found, wanted)) in recalls {
             let recall = f64::from(found as u32) / f64::from(wanted as u32);
             assert!(recall >= least_recall, "recall {recall} at k = {k}");
+        }
+    }
+}
+
+/// Frames and distances of the `k` nearest by the definition, with the distance of the library.
+fn by_definition(
+    latents: &Array2<f64>,
+    frames: &[FrameId],
+    query: &[f64],
+    k: usize,
+    exclusion: Option<Exclusion>,
+) -> Vec<(FrameId, f64)> {
+    let kept = frames
+        .iter()
+        .filter(|&&frame| !exclusion.is_some_and(|excluded| excluded.covers(frame)));
+    let mut all: Vec<(FrameId, f64)> = kept
+        .map(|&frame| (frame, distance(&latents.row(frame.row()).to_vec(), query)))
+        .collect();
+    all.sort_by(|a, b| a.1.total_cmp(&b.1).then(a.0.cmp(&b.0)));
+    all.truncate(k);
+    all
+}
+
+proptest! {
+    /// Oracle: the definition, in f64: frames, their order and distances are equal to the bit, among
+    /// duplicates, near ties, far from zero, and where f32 overflows or underflows.
+    #[test]
+    fn the_exact_index_answers_as_a_scan_in_f64(
+        seed in 0_u64..1_000,
+        rows in 1_usize..400,
+        columns in 1_usize..40,
+        scale in prop::sample::select(vec![1e-200, 1e-30, 1e-3, 1.0, 1e6, 1e25, 1e150]),
+        offset in prop::sample::select(vec![0.0, 1.0, 1e7]),
+        noise in prop::sample::select(vec![0.0, 1e-15, 1e-7, 1e-3]),
+        k in 0_usize..50,
+        radius in prop::option::of(0_u32..30),
+        queries in 1_usize..7,
+    ) {
+        // Some places with several frames each, which differ by the noise.
+        let places = random(rows.div_ceil(7), columns, seed);
+        let noises = random(rows, columns, seed + 1);
+        let latents = Array2::from_shape_fn((rows, columns), |at| {
+            let place = places[(at.0 * 31 % places.nrows(), at.1)];
+            scale * (offset + place + noise * noises[at])
+        });
+
+        // Half of the frames, the last one first.
+        let some: Vec<FrameId> = frames(rows).into_iter().rev().filter(|frame| frame.0 % 2 == 0).collect();
+        let index = ExactIndex::new(latents.view(), &some);
+        let exclusion = radius.map(|radius| Exclusion { center: FrameId((rows / 2) as u32), radius });
+        let queries: Vec<Vec<f64>> = (0..queries)
+            .map(|query| {
+                let between = &latents.row(query % rows) + &latents.row(query * 13 % rows);
+                (between * 0.5 + scale * noise).to_vec()
+            })
+            .collect();
+
+        let slices: Vec<&[f64]> = queries.iter().map(Vec::as_slice).collect();
+        let together = index.nearest_of_each(&slices, k, exclusion);
+        for (query, together) in queries.iter().zip(together) {
+            let found = index.nearest(query, k, exclusion);
+            prop_assert_eq!(&found, &together);
+            let found: Vec<(FrameId, f64)> = found.iter().map(|hit| (hit.frame, hit.distance)).collect();
+            prop_assert_eq!(found, by_definition(&latents, &some, query, k, exclusion));
         }
     }
 }

@@ -11,7 +11,7 @@ use seese3_core::matrices::to_nalgebra;
 use seese3_core::room::FrameId;
 
 /// Number of principal components.
-const COMPONENTS: usize = 32;
+pub const COMPONENTS: usize = 32;
 /// Maximum number of mapped frames used for the PCA.
 const SAMPLED: usize = 128;
 /// Minimum number of mapped frames for the PCA.

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView1, ArrayView2, Axis, s};
 
-use super::appearance::{Appearance, RoomAppearance};
+use super::appearance::{Appearance, COMPONENTS, RoomAppearance};
 use super::blend::{Blend, BlendErrors, LOOKED_AT, Likeness, ViewErrors};
 use super::clock::frame_period_s;
 use super::{Error, PoseWithCovariance};
@@ -97,6 +97,9 @@ pub struct MapMatch {
 }
 
 impl Map {
+    /// The largest number of coordinates of a view's appearance.
+    pub const COMPONENTS: usize = COMPONENTS;
+
     /// Builds a map of the frames `mapped` of a room, given in order.
     ///
     /// # Errors

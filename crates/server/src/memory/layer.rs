@@ -2,6 +2,7 @@
 
 use std::future::Future;
 use std::pin::Pin;
+use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
@@ -21,7 +22,7 @@ use super::super::holding_body::holding;
 use super::super::rpcs::rpc;
 use super::super::status::Full;
 use super::decoded::{PREFIX, decoded_size};
-use super::response::{ResponseTimeout, in_pieces};
+use super::response::{Responses, in_pieces};
 use super::stream::{CountedBody, StreamMemory};
 use super::{MEMORY_LEASE, Memory, MemoryLease};
 
@@ -40,8 +41,8 @@ pub struct MemoryLayer {
     pub message_bytes: usize,
     /// Receive timeout of a request with one message.
     pub receive_within: Duration,
-    /// Timeout of a response that the caller does not receive.
-    pub response_timeout: Duration,
+    /// The responses that are being sent.
+    pub responses: Arc<Responses>,
 }
 
 impl<S> Layer<S> for MemoryLayer {
@@ -96,7 +97,7 @@ where
             };
 
             let peer = peer.filter(|_| !is_watch);
-            let timeout = peer.map(|peer| ResponseTimeout::new(peer, layer.response_timeout));
+            let timeout = peer.map(|peer| layer.responses.begin(peer));
             Ok(response.map(|body| in_pieces(holding(body, held), timeout)))
         })
     }

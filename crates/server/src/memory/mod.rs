@@ -12,6 +12,7 @@ mod response;
 mod stream;
 
 pub use layer::MemoryLayer;
+pub use response::Responses;
 pub use stream::StreamMemory;
 
 use std::sync::atomic::{AtomicUsize, Ordering};

@@ -5,15 +5,15 @@
 //! frame as soon as one byte fits. Frames are therefore kept short.
 
 use std::pin::Pin;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
 use bytes::Bytes;
 use http_body::{Frame, SizeHint};
-use tokio::sync::Notify;
-use tokio::task::JoinHandle;
+use slab::Slab;
+use tokio::time::Instant;
 use tonic::Status;
 use tonic::body::Body;
 
@@ -22,54 +22,114 @@ use super::super::connections::Peer;
 /// Maximum data frame size, bytes; HTTP/2's default.
 const PIECE: usize = 16 << 10;
 
-/// Progress timeout of a response. A caller that receives nothing for that time, while there is
-/// something to receive, loses its connection: data in flight cannot be withdrawn otherwise.
-pub struct ResponseTimeout {
-    progress: Arc<Progress>,
-    waiting: JoinHandle<()>,
+/// Parts of the time limit after which responses are looked at.
+const LOOKS: u32 = 8;
+
+/// The responses that are being sent. A caller that receives nothing for a time limit, or up to an eighth
+/// more, while there is something to receive, loses its connection: data in flight cannot be withdrawn
+/// otherwise.
+#[derive(Debug)]
+pub struct Responses {
+    limit: Duration,
+    began: Instant,
+    open: Mutex<Slab<Arc<Progress>>>,
 }
 
-#[derive(Default)]
+#[derive(Debug)]
 struct Progress {
-    /// Notified whenever the transport polls for a piece.
-    polled: Notify,
+    peer: Peer,
+    /// When the transport last polled for a piece, milliseconds after the start of [`Responses`].
+    polled_ms: AtomicU64,
     /// Whether the handler has nothing to send: the caller need not receive anything.
     is_waiting: AtomicBool,
 }
 
-impl ResponseTimeout {
-    /// Starts the timeout.
-    pub fn new(peer: Peer, limit: Duration) -> Self {
-        let progress = Arc::new(Progress::default());
-        let watched = progress.clone();
-        let waiting = tokio::spawn(async move {
-            loop {
-                let polled = tokio::time::timeout(limit, watched.polled.notified()).await;
-                if polled.is_err() && !watched.is_waiting.load(Ordering::Relaxed) {
-                    break;
-                }
-            }
-            if peer.close() {
-                let address = peer.address;
-                tracing::warn!(%address, "response timeout: connection closed");
-            }
+impl Responses {
+    /// Starts the task that looks at the responses. It ends with them.
+    pub fn watched(limit: Duration) -> Arc<Self> {
+        let responses = Arc::new(Self {
+            limit,
+            began: Instant::now(),
+            open: Mutex::default(),
         });
 
-        Self { progress, waiting }
+        let known = Arc::downgrade(&responses);
+        let pause = (limit / LOOKS).max(Duration::from_millis(1));
+        tokio::spawn(async move {
+            loop {
+                tokio::time::sleep(pause).await;
+                let Some(responses) = known.upgrade() else {
+                    return;
+                };
+                responses.close_stalled();
+            }
+        });
+        responses
     }
 
+    /// Watches a new response to `peer`.
+    pub fn begin(self: &Arc<Self>, peer: Peer) -> ResponseTimeout {
+        let progress = Arc::new(Progress {
+            peer,
+            polled_ms: AtomicU64::new(self.now_ms()),
+            is_waiting: AtomicBool::new(false),
+        });
+        ResponseTimeout {
+            key: self.open().insert(progress.clone()),
+            responses: self.clone(),
+            progress,
+        }
+    }
+
+    /// Closes the connections whose callers receive nothing.
+    fn close_stalled(&self) {
+        let limit = u64::try_from(self.limit.as_millis()).unwrap_or(u64::MAX);
+        let now = self.now_ms();
+        let is_stalled = |progress: &Progress| {
+            let since = now.saturating_sub(progress.polled_ms.load(Ordering::Relaxed));
+            since >= limit && !progress.is_waiting.load(Ordering::Relaxed)
+        };
+
+        for (_, progress) in self.open().iter() {
+            if is_stalled(progress) && progress.peer.close() {
+                let address = progress.peer.address;
+                tracing::warn!(%address, "response timeout: connection closed");
+            }
+        }
+    }
+
+    fn now_ms(&self) -> u64 {
+        u64::try_from(self.began.elapsed().as_millis()).unwrap_or(u64::MAX)
+    }
+
+    fn open(&self) -> MutexGuard<'_, Slab<Arc<Progress>>> {
+        self.open.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// The place of a response among the [`Responses`].
+pub struct ResponseTimeout {
+    responses: Arc<Responses>,
+    key: usize,
+    progress: Arc<Progress>,
+}
+
+impl ResponseTimeout {
     /// Records that the transport polled; `is_waiting` if there was nothing to send.
     fn polled(&self, is_waiting: bool) {
-        self.progress
-            .is_waiting
-            .store(is_waiting, Ordering::Relaxed);
-        self.progress.polled.notify_one();
+        let Progress {
+            polled_ms,
+            is_waiting: known,
+            ..
+        } = self.progress.as_ref();
+        polled_ms.store(self.responses.now_ms(), Ordering::Relaxed);
+        known.store(is_waiting, Ordering::Relaxed);
     }
 }
 
 impl Drop for ResponseTimeout {
     fn drop(&mut self) {
-        self.waiting.abort();
+        self.responses.open().try_remove(self.key);
     }
 }
 

@@ -67,6 +67,13 @@ impl ServedRoom {
         }
     }
 
+    /// The number of latent coordinates of the adapter that has most of them.
+    pub fn widest_latent(&self) -> usize {
+        let adapters = self.candidates.iter().map(|candidate| &candidate.adapter);
+        let widths = adapters.map(|stored| stored.adapter.latent_dim());
+        widths.max().unwrap_or(0)
+    }
+
     /// Whether an adapter of this name serves the room; before the first load, whether it is a
     /// candidate.
     pub fn is_served_by(&self, adapter: &str) -> bool {

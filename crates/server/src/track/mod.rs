@@ -242,7 +242,10 @@ impl Handlers {
                     .other_views
                     .iter()
                     .filter_map(|other| other.view.as_ref());
-                Lane::of(frame.view.iter().chain(others))
+                match Lane::of(frame.view.iter().chain(others)) {
+                    Lane::Short => session.lane(),
+                    lane => lane,
+                }
             }
             _ => Lane::Short,
         };

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use super::super::Error;
 use super::super::convert;
+use super::super::cost::products;
 use super::super::localization::asked_rooms;
 use super::super::relocalization::can_track;
 use super::super::snapshot::{
@@ -13,6 +14,7 @@ use seese3_client::proto::v1 as pb;
 use seese3_core::navigation::RetrievedFrame;
 use seese3_core::room::Room;
 use seese3_robot::pose_filter::FilterParameters;
+use seese3_robot::tracking::Map;
 use seese3_store::StoredAdapter;
 
 /// A room in which a stream tracks its camera.
@@ -58,6 +60,17 @@ impl TrackedRoom {
             content: frames_content(&loaded.room, None, loaded.room.frame_count()),
             served: None,
         })
+    }
+
+    /// Products of coordinates when a view without an image is compared with the room.
+    pub fn products(&self) -> f64 {
+        let Some(served) = &self.served else {
+            return 0.0;
+        };
+        let adapter = &served.adapter.adapter;
+        let by_reader = served.room_reader().map_or(0, |_| adapter.source().dim);
+        let coordinates = adapter.latent_dim() + Map::COMPONENTS + by_reader;
+        products(coordinates, self.room.frame_count())
     }
 
     /// The adapter of the stream.

@@ -5,10 +5,12 @@ use std::time::Duration;
 
 use super::super::Error;
 use super::super::convert;
+use super::super::cost::brief_or_short;
 use super::super::embedding::{EmbeddedView, ImageKeypoints, StoredFrames, ViewEmbedder};
 use super::super::relocalization::maps;
 use super::super::snapshot::Snapshot;
 use super::super::stated_revisions::StatesRevisions;
+use super::super::workers::Lane;
 use super::Overtaken;
 use super::configuration::{StreamFrames, back_pressure, is_fused, parameters, rooms};
 use super::depth::DepthImage;
@@ -186,6 +188,15 @@ impl Session {
     /// The stream's room; `None` while it is unknown.
     fn room(&self) -> Option<&TrackedRoom> {
         Some(&self.rooms[self.engine.room()?])
+    }
+
+    /// The lane of a frame without images.
+    pub fn lane(&self) -> Lane {
+        let rooms = match self.room_to_match() {
+            Some(room) => &self.rooms[room..=room],
+            None => &self.rooms,
+        };
+        brief_or_short(rooms.iter().map(TrackedRoom::products).sum())
     }
 
     /// Whether only the newest of the waiting frames is answered.

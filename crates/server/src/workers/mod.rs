@@ -1,4 +1,5 @@
-//! Computes answers on a bounded number of blocking threads, within the caller's deadline.
+//! Computes answers on a bounded number of blocking threads, within the caller's deadline. Brief work is done
+//! on the thread that received the request: to wake another one takes longer.
 //!
 //! - Each [`Lane`] has its own threads and queue: short requests, images, long requests,
 //!   evaluations and fits. Within a lane, callers share the time of the threads.
@@ -13,9 +14,11 @@
 mod fair_queue;
 mod pool;
 
+use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
 use std::time::Duration;
 
+use tokio::runtime::{Handle, RuntimeFlavor};
 use tokio::sync::watch;
 use tonic::Request;
 use tonic::metadata::MetadataMap;
@@ -27,13 +30,16 @@ use super::status::Full;
 use super::{Config, Error};
 use fair_queue::Urgency;
 pub use pool::off_the_lane;
-use pool::{Pool, pause_if_others_wait};
+use pool::{Pool, Turn, pause_if_others_wait};
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
 
 /// Kind of work, which selects the threads and the queue.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Lane {
+    /// Work of about a tenth of a millisecond that does not wait. It is done in place if a thread of the lane
+    /// for short work is free, and is short work otherwise.
+    Brief,
     /// Work of at most milliseconds, for instance in a robot's control loop.
     Short,
     /// Requests with one image or two, and frames of streams with images.
@@ -58,7 +64,7 @@ impl Lane {
     /// The limit of this lane.
     fn full(self) -> Full {
         match self {
-            Self::Short => Full::ShortRequests,
+            Self::Brief | Self::Short => Full::ShortRequests,
             Self::Images => Full::Images,
             Self::Long => Full::LongRequests,
             Self::Evaluation => Full::Evaluations,
@@ -133,7 +139,7 @@ impl Workers {
 
     fn pool(&self, lane: Lane) -> &Pool {
         match lane {
-            Lane::Short => &self.short,
+            Lane::Brief | Lane::Short => &self.short,
             Lane::Images => &self.images,
             Lane::Long => &self.long,
             Lane::Evaluation => &self.evaluation,
@@ -178,6 +184,10 @@ impl Workers {
         context: CallContext,
         work: impl FnOnce(&Cancellation) -> Result<T, Error> + Send + 'static,
     ) -> Result<T, Error> {
+        if let Some(turn) = self.turn_in_place(lane, &context.caller) {
+            return self.in_place(turn, || work(&Cancellation::default()))?;
+        }
+
         // If the caller goes away, this future is dropped and the guard cancels the running work.
         let cancel = Arc::new(Cancellation::with_checkpoint(pause_if_others_wait));
         let guard = CancelOnDrop(cancel.clone());
@@ -203,8 +213,34 @@ impl Workers {
         caller: CallerId,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<T, Error> {
+        if let Some(turn) = self.turn_in_place(lane, &caller) {
+            return self.in_place(turn, work);
+        }
+
         // Dropping the future only discards the result.
         self.on_thread(lane, caller, Urgency::Frame, work).await
+    }
+
+    /// The right to do brief work in place.
+    fn turn_in_place(&self, lane: Lane, caller: &CallerId) -> Option<Turn> {
+        // Another runtime has one thread, which must never wait.
+        let is_allowed = Handle::current().runtime_flavor() == RuntimeFlavor::MultiThread;
+        (lane == Lane::Brief && is_allowed)
+            .then(|| self.pool(lane).turn_now(caller))
+            .flatten()
+    }
+
+    fn in_place<T>(&self, turn: Turn, work: impl FnOnce() -> T) -> Result<T, Error> {
+        if *self.halted.borrow() {
+            return Err(Error::Loading);
+        }
+
+        // Unwind safe: what the work has changed is dropped with it.
+        let work = AssertUnwindSafe(|| turn.run_in_place(work));
+        std::panic::catch_unwind(work).map_err(|_| {
+            tracing::error!("a request panicked");
+            Error::Internal
+        })
     }
 
     /// Runs `work` on a blocking thread of the lane as soon as it is the caller's turn.
@@ -299,6 +335,61 @@ mod tests {
         );
 
         assert_eq!(workers.run(Lane::Short, long(), |_| Ok(7)).await, Ok(7));
+    }
+
+    /// Oracle: the contract: brief work runs on the thread of the runtime that asks for it, a panic
+    /// costs one request, and work that has to wait may wait.
+    #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+    async fn brief_work_is_done_in_place() {
+        let asked = tokio::spawn(async {
+            let workers = workers(1, 0);
+            let thread = || std::thread::current().id();
+            let found = workers.run(Lane::Brief, long(), move |_| Ok(thread()));
+            assert_eq!(found.await, Ok(thread()));
+
+            let panicked = workers.run::<()>(Lane::Brief, long(), |_| panic!("on purpose"));
+            assert_eq!(panicked.await, Err(Error::Internal));
+
+            let wait = || tokio::runtime::Handle::current().block_on(async { 7 });
+            let waited = workers.run(Lane::Brief, long(), move |_| {
+                off_the_lane(wait).map_err(|_| Error::Internal)
+            });
+            assert_eq!(waited.await, Ok(7));
+        });
+        asked.await.unwrap();
+    }
+
+    /// Oracle: the contract: while the only thread of the lane works, brief work is short work,
+    /// which waits in the queue, or is refused without one.
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn brief_work_takes_turns_with_short_work() {
+        for (queue, expected) in [(1, Ok(2)), (0, Err(Full::ShortRequests))] {
+            let workers = workers(1, queue);
+            let (release, wait) = std::sync::mpsc::channel::<()>();
+            let (begun, begins) = tokio::sync::oneshot::channel();
+            let busy = workers.clone();
+            let first = tokio::spawn(async move {
+                busy.run(Lane::Short, long(), move |_| {
+                    let _ = begun.send(());
+                    let _ = wait.recv();
+                    Ok(1)
+                })
+                .await
+            });
+            begins.await.unwrap();
+
+            let mut second = Box::pin(workers.run(Lane::Brief, long(), |_| Ok(2)));
+            let at_once = futures_util::poll!(&mut second);
+            assert_eq!(at_once.is_pending(), queue > 0);
+            release.send(()).unwrap();
+            assert_eq!(first.await.unwrap(), Ok(1));
+            if queue > 0 {
+                assert_eq!(second.await, Ok(2));
+            } else {
+                let refused = expected.map_err(|what| Error::Full { what });
+                assert_eq!(at_once, std::task::Poll::Ready(refused));
+            }
+        }
     }
 
     /// Oracle: the contract. The work loops until it is cancelled and then reports that.

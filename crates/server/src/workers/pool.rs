@@ -1,6 +1,6 @@
 //! Threads of one lane, shared between callers in time slices.
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -20,6 +20,8 @@ const MOST_PAUSED: usize = 256;
 thread_local! {
     /// The turn of the job that runs on this thread.
     static TURN: RefCell<Option<Turn>> = const { RefCell::new(None) };
+    /// Whether this thread, which is one of the async runtime, computes an answer in place.
+    static IN_PLACE: Cell<bool> = const { Cell::new(false) };
 }
 
 /// The threads of a lane and its queue.
@@ -97,10 +99,8 @@ impl Pool {
         let (granted, turn) = oneshot::channel();
         let (ticket, _place) = {
             let mut state = self.lock();
-            if state.free > 0 {
-                state.free -= 1;
-                let charged = state.waiting.start(caller);
-                return Ok(self.begin(caller.clone(), charged));
+            if let Some(turn) = self.free_turn(&mut state, caller) {
+                return Ok(turn);
             }
 
             let place = self.place(caller, urgency)?;
@@ -116,14 +116,23 @@ impl Pool {
         turn.await.map_err(|_| Exhausted::Budget)
     }
 
+    /// A thread, if one is free now.
+    pub fn turn_now(&self, caller: &CallerId) -> Option<Turn> {
+        self.free_turn(&mut self.lock(), caller)
+    }
+
+    fn free_turn(&self, state: &mut State, caller: &CallerId) -> Option<Turn> {
+        state.free = state.free.checked_sub(1)?;
+        let charged = state.waiting.start(caller);
+        Some(self.begin(caller.clone(), charged))
+    }
+
     /// Waits for a thread, for a job that has had one before. Blocks.
     fn next_turn(&self, caller: CallerId) -> Turn {
         let (granted, turn) = oneshot::channel();
         let mut state = self.lock();
-        if state.free > 0 {
-            state.free -= 1;
-            let charged = state.waiting.start(&caller);
-            return self.begin(caller, charged);
+        if let Some(turn) = self.free_turn(&mut state, &caller) {
+            return turn;
         }
         state.wait(&caller, Urgency::Paused, granted);
         drop(state);
@@ -200,6 +209,21 @@ impl Turn {
         work()
     }
 
+    /// Runs brief work on this thread of the async runtime.
+    pub fn run_in_place<T>(self, work: impl FnOnce() -> T) -> T {
+        /// Ends it also if the work panics.
+        struct End;
+        impl Drop for End {
+            fn drop(&mut self) {
+                IN_PLACE.set(false);
+            }
+        }
+
+        IN_PLACE.set(true);
+        let _end = End;
+        work()
+    }
+
     /// Passes the thread on and waits for the next turn, if the slice is over and others wait.
     /// Blocks the thread of the operating system meanwhile.
     fn paused(mut self) -> Self {
@@ -236,6 +260,10 @@ impl Turn {
 /// # Errors
 /// The limit of waiting jobs that is reached.
 pub fn off_the_lane<T>(work: impl FnOnce() -> T) -> Result<T, Exhausted> {
+    // The runtime moves its other tasks to another thread.
+    if IN_PLACE.replace(false) {
+        return Ok(tokio::task::block_in_place(work));
+    }
     let Some(turn) = TURN.take() else {
         return Ok(work());
     };
