@@ -2,8 +2,10 @@
 //!
 //! Time is counted in comparisons: one comparison of a view with one stored frame, about 10 ns.
 
+use std::sync::Arc;
+
 use super::Error;
-use super::snapshot::Snapshot;
+use super::snapshot::{ServedRoom, Snapshot};
 use super::workers::{Lane, image_count, images_of};
 use seese3_client::proto::v1 as pb;
 use seese3_core::navigation::{IndexKind, Limits, NavigatorKind, RetrievalMetric, StepKind};
@@ -37,10 +39,13 @@ impl Costs<'_> {
         }
     }
 
-    /// Lane of `views` views that are compared with the frames of a room, as latents.
+    /// Lane of `views` views that are compared with the frames of a room, as latents. A room that is not in
+    /// memory is read from the store, which may take any time.
     pub fn brief(&self, room: &str, views: f64) -> Lane {
         let room = self.snapshot.rooms().get(room);
-        let Some(room) = room.filter(|_| self.index == IndexKind::Exact) else {
+        let is_brief =
+            |room: &&Arc<ServedRoom>| self.index == IndexKind::Exact && room.is_in_memory();
+        let Some(room) = room.filter(is_brief) else {
             return Lane::Short;
         };
         brief_or_short(views * products(room.widest_latent(), room.summary.frame_count))
@@ -113,8 +118,9 @@ pub fn brief_or_short(products: f64) -> Lane {
     }
 }
 
-/// Whether a request needs only what is prepared when a room is loaded. A refit is fitted at its first request,
-/// some metrics are prepared then, and the relational reader takes milliseconds.
+/// Whether a request needs only what is prepared when the served revision of a room is loaded. A stated revision
+/// may be another one, a refit is fitted at its first request, some metrics are prepared then, and the relational
+/// reader takes milliseconds.
 fn is_prepared(request: &pb::NavigateRequest) -> bool {
     let is_prepared = |navigator| {
         matches!(
@@ -125,8 +131,10 @@ fn is_prepared(request: &pb::NavigateRequest) -> bool {
             )
         )
     };
-    request.navigator.is_empty()
-        || NavigatorKind::from_name(&request.navigator).is_some_and(is_prepared)
+    let has_revision = request.room_revision.is_some() || request.adapter_revision.is_some();
+    let is_known = request.navigator.is_empty()
+        || NavigatorKind::from_name(&request.navigator).is_some_and(is_prepared);
+    is_known && !has_revision
 }
 
 /// Lane of a request with images to decode and comparisons.

@@ -161,6 +161,11 @@ impl ServedRoom {
         loaded.map(Arc::new)
     }
 
+    /// Whether the room is in memory now.
+    pub fn is_in_memory(&self) -> bool {
+        self.in_memory().is_some()
+    }
+
     /// The loaded room, if it is in memory.
     pub(super) fn in_memory(&self) -> Option<Arc<LoadedRoom>> {
         self.cache.get(self.key)

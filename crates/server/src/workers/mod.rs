@@ -352,7 +352,8 @@ mod tests {
 
             let wait = || tokio::runtime::Handle::current().block_on(async { 7 });
             let waited = workers.run(Lane::Brief, long(), move |_| {
-                off_the_lane(wait).map_err(|_| Error::Internal)
+                let twice = off_the_lane(wait).and_then(|_| off_the_lane(wait));
+                twice.map_err(|_| Error::Internal)
             });
             assert_eq!(waited.await, Ok(7));
         });

@@ -261,7 +261,7 @@ impl Turn {
 /// The limit of waiting jobs that is reached.
 pub fn off_the_lane<T>(work: impl FnOnce() -> T) -> Result<T, Exhausted> {
     // The runtime moves its other tasks to another thread.
-    if IN_PLACE.replace(false) {
+    if IN_PLACE.get() {
         return Ok(tokio::task::block_in_place(work));
     }
     let Some(turn) = TURN.take() else {
