@@ -1,6 +1,6 @@
 # `just check` is the developer's habit and all of CI.
 
-check: test lean lint doc hygiene e2e
+check: test lean lint doc hygiene instructions e2e
 
 test:
     cargo test --workspace --features full
@@ -72,6 +72,13 @@ bench:
 # The serving path beside what one would use instead, in one run; installs these peers.
 bench-peers *words:
     benches/peers/run.sh {{words}}
+
+# Instruction counts of the hot paths, against the committed ones, or those of a commit.
+instructions:
+    .ci/instructions
+
+instructions-against commit:
+    .ci/instructions --against {{commit}}
 
 # Makes the expected values of tests/golden again; needs the packages of tests/golden/requirements.txt.
 golden:

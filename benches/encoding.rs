@@ -20,8 +20,8 @@ use seese3_core::cancel::Cancellation;
 use seese3_core::image::RgbImage;
 use seese3_core::room::Timeline;
 use seese3_encoder::{
-    Encoder, Layer, ModelTask, OnBadImage, Runtime, RuntimeKind, Task, encode_room, read_image,
-    recipe,
+    Device, Encoder, Layer, ModelTask, OnBadImage, Runtime, RuntimeKind, Task, encode_room,
+    read_image, recipe,
 };
 use seese3_studio::{Camera, SuiteRoom, render};
 
@@ -44,6 +44,7 @@ fn encoder(shared: &Path, kind: RuntimeKind) -> Option<Encoder> {
         kind,
         threads: threads(),
         library,
+        device: Device::Cpu,
     };
 
     let recipe = recipe("effnetlite0").unwrap();

@@ -19,16 +19,15 @@ use rand::{RngExt, SeedableRng};
 use seese3_core::adapter::{Adapter, Mixture, Samples, Siamese, TrainConfig, Trainer, Widths};
 use seese3_core::cancel::Cancellation;
 use seese3_core::features::{FeatureSource, Features};
-use seese3_core::geometry::{Twist, exp};
+use seese3_core::geometry::Twist;
 use seese3_core::index::{ExactIndex, HnswIndex, HnswParameters, Index};
 use seese3_core::navigation::{
     FitOn, IndexKind, Limits, Method, Mode, Navigator, Query, Reading, RequestedMotion,
     RetrievalMetric, Source, SourceAt, StepKind,
 };
-use seese3_core::room::{FrameId, Frames, Provenance, Room, RoomId};
+use seese3_core::room::{FrameId, Room};
 use seese3_testing::panorama::{self, Panorama};
-
-const DIM: usize = 768;
+use seese3_testing::wave_room::{COLUMNS, wave_room};
 
 fn random(rows: usize, columns: usize, seed: u64) -> Array2<f64> {
     let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
@@ -46,34 +45,13 @@ fn trajectory(rows: usize) -> Array2<f64> {
 }
 
 fn room(frame_count: usize) -> (Arc<Room>, Features) {
-    let wave = |t: usize, axis: usize| 0.02 * (t as f64 / (9.0 + 3.0 * axis as f64)).sin();
-    let step = |t: usize| {
-        exp(&Twist {
-            linear: nalgebra::Vector3::from_fn(|axis, _| wave(t, axis)),
-            angular: nalgebra::Vector3::from_fn(|axis, _| wave(t, 3 + axis)),
-        })
-    };
-    let poses = (0..frame_count).scan(nalgebra::Isometry3::identity(), |pose, t| {
-        *pose *= step(t);
-        Some(*pose)
-    });
-
-    let frames = Frames {
-        poses: poses.collect(),
-        ..Frames::default()
-    };
-    let room = Room::new(RoomId::new("bench").unwrap(), frames, Provenance::default()).unwrap();
-
-    let rows = random(frame_count, DIM, 1).mapv(|x| x as f32);
-    (
-        Arc::new(room),
-        Features::new(FeatureSource::imported("bench", DIM), rows).unwrap(),
-    )
+    let (room, features) = wave_room("bench", 1, frame_count);
+    (Arc::new(room), features)
 }
 
 fn adapter() -> Arc<Adapter> {
     let widths = Widths {
-        feature: DIM,
+        feature: COLUMNS,
         hidden: 64,
         latent: 20,
     };
@@ -89,7 +67,7 @@ fn adapter() -> Arc<Adapter> {
     let scale = samples.scale().clone();
     Arc::new(
         Adapter::new(
-            FeatureSource::imported("bench", DIM),
+            FeatureSource::imported("bench", COLUMNS),
             Siamese::initial(widths, 0),
             scale,
         )
@@ -233,7 +211,7 @@ fn epoch(criterion: &mut Criterion) {
         Samples::<f32>::new(features.rows(), room.poses().to_vec(), pairs.clone()).unwrap();
 
     let widths = Widths {
-        feature: DIM,
+        feature: COLUMNS,
         hidden: 64,
         latent: 20,
     };
@@ -262,7 +240,7 @@ fn epoch(criterion: &mut Criterion) {
         });
     });
 
-    let weight = random(64, DIM, 5).mapv(|x| x as f32);
+    let weight = random(64, COLUMNS, 5).mapv(|x| x as f32);
 
     let gathered: Vec<Array2<f32>> = batches
         .iter()

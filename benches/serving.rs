@@ -16,60 +16,24 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use ndarray::Array2;
-use rand::{RngExt, SeedableRng};
 use seese3_client::Client;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::navigation_service_server::{
     NavigationService, NavigationServiceServer,
 };
 use seese3_core::adapter::Preset;
-use seese3_core::features::{FeatureSource, Features};
-use seese3_core::geometry::{Twist, exp};
-use seese3_core::room::{Frames, Provenance, Room, RoomId};
+use seese3_core::features::Features;
 use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
 use seese3_store::Store;
+use seese3_testing::wave_room::{COLUMNS, wave_room};
 use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
 use tonic::{Request, Response, Status};
 
-const COLUMNS: usize = 768;
 const STEPS: u32 = 4;
 /// Connections that share the requests in flight.
 const CONNECTIONS: usize = 4;
-
-/// A camera on a wavy path, and features that depend on its pose.
-fn room(frame_count: usize) -> (Room, Features) {
-    let wave = |t: usize, axis: usize| 0.02 * (t as f64 / (9.0 + 3.0 * axis as f64)).sin();
-    let step = |t: usize| {
-        exp(&Twist {
-            linear: nalgebra::Vector3::from_fn(|axis, _| wave(t, axis)),
-            angular: nalgebra::Vector3::from_fn(|axis, _| wave(t, 3 + axis)),
-        })
-    };
-    let poses = (0..frame_count).scan(nalgebra::Isometry3::identity(), |pose, t| {
-        *pose *= step(t);
-        Some(*pose)
-    });
-    let frames = Frames {
-        poses: poses.collect(),
-        ..Frames::default()
-    };
-    let room = Room::new(RoomId::new("bench").unwrap(), frames, Provenance::default()).unwrap();
-
-    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(1);
-    let weights = Array2::from_shape_simple_fn((COLUMNS, 12), || random.random_range(-1.0..1.0));
-    let rows = Array2::from_shape_fn((frame_count, COLUMNS), |(row, column)| {
-        let pose = room.poses()[row].to_homogeneous();
-        let sum: f64 = (0..12)
-            .map(|i| weights[(column, i)] * pose[(i / 4, i % 4)])
-            .sum();
-        (sum.sin() + 0.01 * random.random_range(-1.0..1.0)) as f32
-    });
-    let features = Features::new(FeatureSource::imported("bench", COLUMNS), rows).unwrap();
-    (room, features)
-}
 
 /// Answers every request with the same response.
 struct Empty {
@@ -108,7 +72,7 @@ impl NavigationService for Empty {
 
 /// Makes a store with a room and an adapter that was trained in it.
 async fn make(folder: &str, frame_count: usize) {
-    let (room, features) = room(frame_count);
+    let (room, features) = wave_room("bench", 1, frame_count);
     let data = [RoomData {
         room: &room,
         revision: 1,
@@ -239,6 +203,21 @@ async fn measured(
     [answers as f64 / elapsed, median(&mut times)]
 }
 
+/// Number of requests that two services answer with the same frames.
+async fn same_frames(addresses: [&str; 2], requests: &[pb::NavigateRequest]) -> usize {
+    let [mut first, mut second] = [Vec::new(), Vec::new()];
+    for (address, found) in addresses.into_iter().zip([&mut first, &mut second]) {
+        let client = Client::connect(address, Duration::from_secs(10)).await;
+        let client = client.unwrap();
+        for request in requests {
+            let answer = client.navigate(request.clone()).await.unwrap();
+            let frames = answer.steps.iter().flat_map(|step| &step.frames);
+            found.push(frames.map(|frame| frame.frame_id).collect::<Vec<u32>>());
+        }
+    }
+    first.iter().zip(&second).filter(|(a, b)| a == b).count()
+}
+
 fn median(numbers: &mut [f64]) -> f64 {
     numbers.sort_by(f64::total_cmp);
     numbers[numbers.len() / 2]
@@ -321,6 +300,13 @@ fn compare(folder: &str, time: Duration, rounds: usize, others: &[&str]) {
     .chain(others)
     .collect();
 
+    for (name, other) in &services[2..] {
+        let same = clients.block_on(same_frames([&address, other], &requests));
+        println!(
+            "{name} answers {same} of {} requests with the frames of seese3",
+            requests.len()
+        );
+    }
     println!(
         "{frame_count} frames, {COLUMNS} columns, {STEPS} steps, {rounds} rounds of {:.1} s",
         time.as_secs_f64()

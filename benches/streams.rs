@@ -18,93 +18,23 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use ndarray::Array2;
-use rand::{RngExt, SeedableRng};
 use seese3_client::Client;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::odometry_service_server::{OdometryService, OdometryServiceServer};
 use seese3_client::proto::v1::track_request::Message;
 use seese3_client::proto::v1::track_response::Answer;
-use seese3_core::adapter::{Adapter, Preset};
-use seese3_core::features::{FeatureSource, Features};
-use seese3_core::geometry::{Pose, Twist, exp};
-use seese3_core::room::{Frames, Provenance, Room, RoomId};
-use seese3_core::splits::Split;
-use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
-use seese3_encoder::{Bounds, Encoder, Runtime, RuntimeKind, decode};
-use seese3_robot::calibration::calibrate;
+use seese3_core::features::Features;
+use seese3_core::room::Room;
+use seese3_encoder::{Bounds, Device, Encoder, Runtime, RuntimeKind, decode};
 use seese3_server::{Config, ImageEncoders, run};
 use seese3_store::Store;
+use seese3_testing::wave_room::{COLUMNS, calibrated, wave_room};
 use tokio::net::TcpListener;
 use tokio_stream::{Stream, StreamExt, wrappers::ReceiverStream};
 
-const COLUMNS: usize = 768;
 const FRAMES: usize = 400;
 /// Streams of one connection.
 const SHARED: usize = 50;
-
-/// A camera on a wavy path, and smooth features of where it is.
-fn room(name: &str, seed: u64) -> (Room, Features) {
-    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
-    let mut pose = Pose::identity();
-    let phases: Vec<f64> = (0..6).map(|_| random.random_range(0.0..6.0)).collect();
-    let wave = |t: f64, axis: usize| 0.02 * (t / (9.0 + 3.0 * axis as f64) + phases[axis]).sin();
-
-    let poses: Vec<Pose> = (0..FRAMES)
-        .map(|t| {
-            let twist =
-                |from: usize| nalgebra::Vector3::from_fn(|axis, _| wave(t as f64, from + axis));
-            pose *= exp(&Twist {
-                linear: twist(0),
-                angular: twist(3),
-            });
-
-            pose
-        })
-        .collect();
-
-    let weights = Array2::from_shape_simple_fn((COLUMNS, 13), || random.random_range(-1.0..1.0));
-    let features = Array2::from_shape_fn((FRAMES, COLUMNS), |(row, column)| {
-        let numbers = poses[row].to_homogeneous();
-        let sum: f64 = (0..12)
-            .map(|i| weights[(column, i)] * numbers[(i / 4, i % 4)])
-            .sum();
-
-        ((sum + weights[(column, 12)]).sin() + 0.01 * random.random_range(-1.0..1.0)) as f32
-    });
-
-    let frames = Frames {
-        poses,
-        ..Frames::default()
-    };
-    let room = Room::new(RoomId::new(name).unwrap(), frames, Provenance::default()).unwrap();
-
-    (
-        room,
-        Features::new(FeatureSource::imported("bench", COLUMNS), features).unwrap(),
-    )
-}
-
-fn adapter(rooms: &[(Room, Features)]) -> (Adapter, seese3_core::adapter::TrainingRecord) {
-    let room_data: Vec<RoomData<'_>> = rooms
-        .iter()
-        .map(|(room, features)| RoomData {
-            room,
-            revision: 1,
-            features,
-        })
-        .collect();
-
-    let plan = TrainingPlan::of(Preset::PaperBase, Split::Whole, 20, 0);
-    let (adapter, record) = train_adapter(&room_data[..1], &plan, &mut |_| ()).unwrap();
-    let calibrated = calibrate(adapter, record, &room_data[1..]).unwrap();
-    assert!(
-        calibrated.can_track,
-        "the streams need an adapter that tracks"
-    );
-
-    (calibrated.adapter, calibrated.record)
-}
 
 /// Answers every message with as many bytes as a tracker's answer has.
 struct Echo;
@@ -330,6 +260,7 @@ async fn images([streams, hz, seconds]: [f64; 3], [store, room, folder, model]: 
         kind,
         threads: 1,
         library,
+        device: Device::Cpu,
     };
     let encoders = ImageEncoders {
         models: vec![model.to_owned()],
@@ -430,9 +361,9 @@ async fn main() {
 /// Streams of features, beside a server that only answers.
 async fn features([streams, hz, seconds]: [f64; 3]) {
     let rooms: Vec<(Room, Features)> = [("map", 1), ("second", 2), ("third", 3)]
-        .map(|(name, seed)| room(name, seed))
+        .map(|(name, seed)| wave_room(name, seed, FRAMES))
         .into();
-    let (adapter, record) = adapter(&rooms);
+    let (adapter, record) = calibrated(&rooms);
 
     let folder = tempfile::tempdir().unwrap();
     let store = Store::create(folder.path().to_str().unwrap()).unwrap();

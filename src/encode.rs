@@ -3,20 +3,24 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use clap::Args;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::encoder::{EncoderOptions, RuntimeOptions, feature_prefix, say_features};
 use super::keypoints::{check_aspect, map_keypoints, mapping_inputs, room_keypoints};
 use super::output::say;
 use super::progress::bar;
+use super::rooms::room_names;
+use super::shard::Shard;
 use super::store_option::StoreAndJson;
 use seese3_core::cancel::Cancellation;
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::{CameraIntrinsics, Pose};
 use seese3_core::room::{Room, is_plain_name};
-use seese3_encoder::{Encoded, Encoder, Journal, Kept, OnBadImage, Task, encode_room, read_image};
+use seese3_encoder::{
+    Encoded, Encoder, Journal, Kept, KeypointOutputs, OnBadImage, Task, encode_room, read_image,
+};
 use seese3_robot::matched_views::{KeypointMap, MappedKeypoints};
 use seese3_store::{Published, RoomContents, RoomKeypoints, Store, StoredRoom};
 
@@ -27,9 +31,14 @@ const NAMED: usize = 20;
 pub struct Encode {
     #[command(flatten)]
     common: StoreAndJson,
-    /// Name of the room; it must have been imported from a recording with images
-    #[arg(long)]
-    room: String,
+    /// The rooms, imported from recordings with images: names, or patterns with *; may be given
+    /// several times. Several rooms are encoded one after the other, and one that fails does not
+    /// stop the others
+    #[arg(long = "room", value_name = "ROOM", required = true)]
+    rooms: Vec<String>,
+    /// Encode only shard I of N of the rooms, to distribute them over jobs: 1/4 to 4/4
+    #[arg(long, value_name = "I/N", default_value = "1/1")]
+    shard: Shard,
     /// The encoder: an ONNX file, or `pixels` or `builtin`, which need no model file
     #[arg(long = "encoder", value_name = "MODEL")]
     model: String,
@@ -62,22 +71,95 @@ pub struct Encode {
 }
 
 impl Encode {
-    #[expect(
-        clippy::too_many_lines,
-        reason = "one command, from its arguments to what it prints"
-    )]
     pub async fn run(self) -> anyhow::Result<()> {
         let store = self.common.open_to_publish().await?;
         let runtime = self.runtime.runtime();
         let encoder = self.encoder.open(&self.model, &runtime)?;
-        let stored = store.load_room(&self.room, None).await?;
-
-        // Names and the image folder are checked first, so that a long run does not fail at its
-        // end.
         let sources = encoder.sources(&feature_prefix(self.prefix.as_deref(), &self.model));
         check_names(&sources)?;
+        // The encoders without a model have no runtime.
+        let runtime = match encoder.runtime() {
+            name if name == runtime.kind.name() => runtime.to_string(),
+            none => none.to_owned(),
+        };
+        say(format_args!(
+            "encoder {} by {runtime}, {}",
+            encoder.id(),
+            sources[0].preprocess
+        ));
+
+        let job = Job {
+            store: &store,
+            encoder: &encoder,
+            sources: &sources,
+            runtime,
+        };
+        match &self.rooms[..] {
+            [room] if !room.contains('*') && self.shard.parts == 1 => {
+                self.common.json.write(&self.encode_room(&job, room).await?)
+            }
+            given => {
+                let rooms = room_names(&store, given).await?;
+                ensure!(
+                    self.images.is_none() || rooms.len() == 1,
+                    "--images is the folder of one room, but {} rooms are given",
+                    rooms.len()
+                );
+                self.encode_rooms(&job, self.shard.tasks(rooms)).await
+            }
+        }
+    }
+
+    /// Encodes rooms one after the other, and writes the JSON record of all. A room that fails is listed.
+    async fn encode_rooms(&self, job: &Job<'_>, rooms: Vec<String>) -> anyhow::Result<()> {
+        let Shard { part, parts } = self.shard;
+        say(format_args!(
+            "{} rooms to encode here (shard {part} of {parts})",
+            rooms.len()
+        ));
+
+        let mut records = Vec::new();
+        let mut failed = Vec::new();
+        for (number, room) in (1..).zip(&rooms) {
+            say(format_args!("room '{room}', {number} of {}", rooms.len()));
+            match self.encode_room(job, room).await {
+                Ok(record) => records.push(record),
+                Err(error) => {
+                    let problem = format!("{error:#}");
+                    say(format_args!("room '{room}' failed: {problem}"));
+                    failed.push(json!({ "room": room, "problem": problem }));
+                }
+            }
+        }
+
+        let written = self.common.json.write(&json!({
+            "shard": format!("{part}/{parts}"),
+            "rooms": records,
+            "failed": failed,
+        }));
+        ensure!(
+            failed.is_empty(),
+            "{} of {} rooms failed, see above; the same command encodes what is missing",
+            failed.len(),
+            rooms.len()
+        );
+        written
+    }
+
+    /// Encodes one room and publishes it; the record of the room.
+    async fn encode_room(&self, job: &Job<'_>, name: &str) -> anyhow::Result<Value> {
+        let Job {
+            store,
+            encoder,
+            sources,
+            ..
+        } = *job;
+        let stored = store.load_room(name, None).await?;
+
+        // The camera and the image folder are checked first, so that a long run does not fail at
+        // its end.
         let camera = stored.room.provenance().camera;
-        let mapping = mapping_inputs(&encoder, camera, &self.room)?;
+        let mapping = mapping_inputs(encoder, camera, name)?;
         let root = images_root(&stored.room, self.images.as_deref())?;
 
         // Features count as present only if encoder, layer and preprocessing match too. A set with
@@ -85,28 +167,48 @@ impl Encode {
         let has_keypoints = mapping.is_none() || has_keypoints(&stored, &sources[0]);
         if !self.again && has_keypoints && sources.iter().all(|source| has(&stored, source)) {
             let names: Vec<&str> = sources.iter().map(|source| source.name.as_str()).collect();
-            let room = &self.room;
             let revision = stored.revision;
             say(format_args!(
-                "already there in room '{room}' revision {revision}: {}",
+                "already there in room '{name}' revision {revision}: {}",
                 names.join(", ")
             ));
 
-            return self.write_record(&sources, revision, 0, &[]);
+            return Ok(record(name, sources, revision, 0, &[]));
         }
 
-        say_replaced(&stored, &sources);
+        say_replaced(&stored, sources);
+        let (published, encoded) = self.encode_anew(job, &stored, &root, mapping).await?;
+        let location = store.location();
         say(format_args!(
-            "encoder {} by {}, {}",
-            encoder.id(),
-            encoder.runtime(),
-            sources[0].preprocess
+            "published room '{name}' revision {}: {location}/{}",
+            published.revision, published.manifest
         ));
+
+        let encoded_now = encoded.good.len() - encoded.resumed.min(encoded.good.len());
+        Ok(record(
+            name,
+            sources,
+            published.revision,
+            encoded_now,
+            &encoded.bad,
+        ))
+    }
+
+    /// Encodes the images below `root` of a room, and publishes the features.
+    async fn encode_anew(
+        &self,
+        job: &Job<'_>,
+        stored: &StoredRoom,
+        root: &Path,
+        mapping: Option<(&KeypointOutputs, CameraIntrinsics)>,
+    ) -> anyhow::Result<(Published, Encoded)> {
+        let Job { store, sources, .. } = *job;
+        let name = stored.room.id().as_str();
 
         // The journal keeps the rows of an interrupted run. Its key covers all inputs of the
         // encoding, so that rows of another model or of changed images are never mixed in.
-        let key = key(&stored, &encoder, &root);
-        let path = self.journal_path(&key)?;
+        let key = key(stored, job, root);
+        let path = self.journal_path(name, &key)?;
         if self.again && path.exists() {
             std::fs::remove_file(&path).with_context(|| path.display().to_string())?;
         }
@@ -118,8 +220,8 @@ impl Encode {
 
         let encoded = self.encode(
             &stored.room,
-            &root,
-            &encoder,
+            root,
+            job.encoder,
             Kept {
                 journal: &mut journal,
                 before,
@@ -131,17 +233,16 @@ impl Encode {
 
         if encoded.good.is_empty() {
             bail!(seese3_encoder::Error::AllBad {
-                room: self.room.clone()
+                room: name.to_owned()
             });
         }
 
         // Another process may have published the room in the meantime. The rows belong to the
         // encoded frames, so these must not have changed.
-        let newest = store.load_room(&self.room, None).await?;
+        let newest = store.load_room(name, None).await?;
         if !same_poses(&newest.room, &stored.room) {
             bail!(
-                "the frames of room '{}' changed during encoding (revision {}, was {}); run the command again",
-                self.room,
+                "the frames of room '{name}' changed during encoding (revision {}, was {}); run the command again",
                 newest.revision,
                 stored.revision
             );
@@ -159,50 +260,16 @@ impl Encode {
             }
             None => None,
         };
-        let published = publish(&store, newest, &sources, &encoded, keypoints.as_ref()).await?;
+        let published = publish(store, newest, sources, &encoded, keypoints.as_ref()).await?;
 
         // The rows are safe in the store, so the journal is no longer needed.
         journal.finish()?;
 
-        say_encoded(&encoded, &sources, seconds);
+        say_encoded(&encoded, sources, seconds);
         if let Some(keypoints) = &keypoints {
             say_keypoints(&keypoints.map);
         }
-        let revision = published.revision;
-        let location = store.location();
-        say(format_args!(
-            "published room '{}' revision {revision}: {location}/{}",
-            self.room, published.manifest
-        ));
-
-        let encoded_now = encoded.good.len() - encoded.resumed.min(encoded.good.len());
-        self.write_record(&sources, revision, encoded_now, &encoded.bad)
-    }
-
-    /// Writes the JSON record of the run.
-    fn write_record(
-        &self,
-        sources: &[FeatureSource],
-        revision: u64,
-        encoded: usize,
-        left_out: &[(usize, String)],
-    ) -> anyhow::Result<()> {
-        let features: Vec<_> = sources
-            .iter()
-            .map(|source| json!({ "name": source.name, "columns": source.dim }))
-            .collect();
-        let left_out: Vec<_> = left_out
-            .iter()
-            .map(|(frame, problem)| json!({ "frame": frame, "problem": problem }))
-            .collect();
-
-        self.common.json.write(&json!({
-            "room": self.room,
-            "revision": revision,
-            "features": features,
-            "encoded_count": encoded,
-            "left_out": left_out,
-        }))
+        Ok((published, encoded))
     }
 
     /// Triangulates the keypoints of the encoded frames.
@@ -217,7 +284,7 @@ impl Encode {
         pool.install(|| map_keypoints(&poses, &encoded.keypoints, camera))
     }
 
-    fn journal_path(&self, key: &str) -> anyhow::Result<PathBuf> {
+    fn journal_path(&self, room: &str, key: &str) -> anyhow::Result<PathBuf> {
         let folder = match &self.journal {
             Some(folder) => folder.clone(),
             None if self.common.store.contains("://") => {
@@ -228,11 +295,7 @@ impl Encode {
 
         // Another encoder, room revision or image folder gives another key, and hence a separate
         // journal.
-        Ok(folder.join(format!(
-            "{}-{}.rows",
-            self.room,
-            seese3_store::short_digest(key)
-        )))
+        Ok(folder.join(format!("{room}-{}.rows", seese3_store::short_digest(key))))
     }
 
     fn encode(
@@ -278,6 +341,41 @@ impl Encode {
 
         encoded.context("the rows encoded so far are kept; run the same command again to resume")
     }
+}
+
+/// What encodes the rooms of a run.
+struct Job<'a> {
+    store: &'a Store,
+    encoder: &'a Encoder,
+    sources: &'a [FeatureSource],
+    /// The runtime and its device, for the journal.
+    runtime: String,
+}
+
+/// The JSON record of a room.
+fn record(
+    room: &str,
+    sources: &[FeatureSource],
+    revision: u64,
+    encoded: usize,
+    left_out: &[(usize, String)],
+) -> Value {
+    let features: Vec<_> = sources
+        .iter()
+        .map(|source| json!({ "name": source.name, "columns": source.dim }))
+        .collect();
+    let left_out: Vec<_> = left_out
+        .iter()
+        .map(|(frame, problem)| json!({ "frame": frame, "problem": problem }))
+        .collect();
+
+    json!({
+        "room": room,
+        "revision": revision,
+        "features": features,
+        "encoded_count": encoded,
+        "left_out": left_out,
+    })
 }
 
 /// Prints which stored features are replaced: those with the same name and a different source.
@@ -363,9 +461,9 @@ pub fn has(stored: &StoredRoom, source: &FeatureSource) -> bool {
 
 /// Journal key. It covers all inputs of the encoding: room, revision, image folder, runtime, images
 /// with their sizes and times, sequences, and sources.
-fn key(stored: &StoredRoom, encoder: &Encoder, root: &Path) -> String {
+fn key(stored: &StoredRoom, job: &Job<'_>, root: &Path) -> String {
     let room = &stored.room;
-    let sources = encoder.sources("");
+    let sources = job.encoder.sources("");
 
     // A file that was rewritten has another size or modification time.
     let state = |image: &String| {
@@ -385,7 +483,7 @@ fn key(stored: &StoredRoom, encoder: &Encoder, root: &Path) -> String {
         room.id(),
         stored.revision,
         root.display(),
-        encoder.runtime(),
+        job.runtime,
         room.images(),
         states,
         room.timeline().sequences,

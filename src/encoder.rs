@@ -10,19 +10,41 @@ use super::named::one_of;
 use super::output::say;
 use seese3_core::features::FeatureSource;
 use seese3_encoder::{
-    self, Encoder, EncoderRecipe, Filter, KeypointOutputs, Layer, ModelTask, Pooling, Preparation,
-    Preprocess, RECIPES, Resize, Runtime, RuntimeKind,
+    self, Device, Encoder, EncoderRecipe, Filter, KeypointOutputs, Layer, ModelTask, Pooling,
+    Preparation, Preprocess, RECIPES, Resize, Runtime, RuntimeKind,
 };
 
-/// Which runtime runs ONNX models, and on how many threads.
+/// What runs ONNX models.
 #[derive(Debug, Clone, Args)]
-pub struct RuntimeOptions {
+pub struct ModelRuntime {
     /// Runtime for ONNX models: tract needs no library, onnxruntime is faster
     #[arg(long, value_parser = one_of::<RuntimeKind>(), default_value = "tract", env = "SEESE3_RUNTIME")]
     runtime: RuntimeKind,
     /// Path of the onnxruntime shared library
     #[arg(long = "onnxruntime", value_name = "FILE", env = "ORT_DYLIB_PATH")]
     library: Option<PathBuf>,
+    /// Processor for ONNX models: cpu, or with onnxruntime also cuda:N, the GPU of that number
+    #[arg(long, value_name = "DEVICE", env = "SEESE3_DEVICE", default_value_t = Device::Cpu)]
+    device: Device,
+}
+
+impl ModelRuntime {
+    /// The options as the library's type.
+    pub fn with_threads(&self, threads: usize) -> Runtime {
+        Runtime {
+            kind: self.runtime,
+            threads,
+            library: self.library.clone(),
+            device: self.device,
+        }
+    }
+}
+
+/// What runs ONNX models, and on how many threads.
+#[derive(Debug, Clone, Args)]
+pub struct RuntimeOptions {
+    #[command(flatten)]
+    models: ModelRuntime,
     /// Number of threads, at most 1024; 0 takes all cores
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u16).range(..=1024))]
     threads: u16,
@@ -31,11 +53,7 @@ pub struct RuntimeOptions {
 impl RuntimeOptions {
     /// The options as the library's type.
     pub fn runtime(&self) -> Runtime {
-        Runtime {
-            kind: self.runtime,
-            threads: self.threads(),
-            library: self.library.clone(),
-        }
+        self.models.with_threads(self.threads())
     }
 
     /// A pool of that many threads.
@@ -149,7 +167,7 @@ impl EncoderOptions {
             "builtin" => Ok(Encoder::builtin()),
             "pixels" => Ok(Encoder::pixels()),
             _ => {
-                remember_encoder_runtime(runtime.kind.name());
+                remember_encoder_runtime(runtime);
                 self.open_file(Path::new(model), runtime)
             }
         }

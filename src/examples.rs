@@ -42,6 +42,7 @@ encode
   seese3 encode --store store --room kitchen --encoder pixels
   seese3 encode --store store --room kitchen --encoder effnetlite0.onnx --recipe effnetlite0 --layers block14
   seese3 encode --store store --room kitchen --encoder vit.onnx --resize 224x224 --preprocess imagenet --pool cls
+  seese3 encode --store store --room 'scene*' --shard 3/16 --encoder vit.onnx --recipe dinov2-b --runtime onnxruntime --device cuda:0
 encoders
   seese3 encoders
   seese3 encoders dinov2-b

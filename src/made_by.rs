@@ -16,7 +16,7 @@ static CALL: OnceLock<Call> = OnceLock::new();
 pub const COMMIT: Option<&str> = option_env!("SEESE3_COMMIT");
 
 /// The runtime of the encoder that was opened first.
-static ENCODER_RUNTIME: OnceLock<&'static str> = OnceLock::new();
+static ENCODER_RUNTIME: OnceLock<String> = OnceLock::new();
 
 #[derive(Debug)]
 struct Call {
@@ -57,8 +57,8 @@ struct Machine {
 struct Runtime {
     /// From the start of the command to the result, seconds.
     seconds: f64,
-    /// The runtime of the ONNX models, for example "tract"; `None` if no model was opened.
-    encoder: Option<&'static str>,
+    /// The runtime of the ONNX models, for example "tract" or "onnxruntime on cuda:0"; `None` if no model was opened.
+    encoder: Option<String>,
 }
 
 /// Records the command line, for the results of this process.
@@ -74,8 +74,8 @@ pub fn remember_call(arguments: &[OsString], matches: &ArgMatches) {
 }
 
 /// Records the runtime of an encoder, for the results of this process.
-pub fn remember_encoder_runtime(name: &'static str) {
-    let _ = ENCODER_RUNTIME.set(name);
+pub fn remember_encoder_runtime(runtime: &seese3_encoder::Runtime) {
+    let _ = ENCODER_RUNTIME.set(runtime.to_string());
 }
 
 impl MadeBy {
@@ -99,7 +99,7 @@ impl MadeBy {
             },
             runtime: Runtime {
                 seconds: (seconds * 1e3).round() / 1e3,
-                encoder: ENCODER_RUNTIME.get().copied(),
+                encoder: ENCODER_RUNTIME.get().cloned(),
             },
         }
     }

@@ -17,6 +17,7 @@ mod pose_options;
 mod store_option;
 #[cfg(feature = "lab")]
 mod rooms;
+mod shard;
 mod ask;
 mod encoders;
 mod export;

@@ -9,11 +9,11 @@ use clap::{ArgAction, Args, ValueEnum};
 use tokio::net::TcpListener;
 use tokio::sync::Notify;
 
+use super::encoder::ModelRuntime;
 use super::log::{LogFormat, Traces, start_log};
-use super::named::one_of;
 use super::output::say;
 use seese3_core::navigation::{IndexKind, Limits};
-use seese3_encoder::{Bounds, Runtime, RuntimeKind};
+use seese3_encoder::Bounds;
 use seese3_server::{
     Config, ImageEncoders, Keyring, Listeners, Quota, Reload, RoomMemory, Tls, TlsFiles, TokenKey,
     run, shutdown_signal,
@@ -89,12 +89,8 @@ pub struct Serve {
         value_delimiter = ','
     )]
     encoders: Vec<String>,
-    /// Runtime for ONNX models: tract needs no library, onnxruntime is faster
-    #[arg(long, env = "SEESE3_RUNTIME", value_parser = one_of::<RuntimeKind>(), default_value = "tract")]
-    runtime: RuntimeKind,
-    /// Path of the onnxruntime shared library
-    #[arg(long = "onnxruntime", value_name = "FILE", env = "ORT_DYLIB_PATH")]
-    library: Option<std::path::PathBuf>,
+    #[command(flatten)]
+    models: ModelRuntime,
     /// Maximum size of an image, 1 to 1000000000 pixels after decoding
     #[arg(long, env = "SEESE3_MAX_IMAGE_PIXELS", default_value_t = 16_000_000, value_parser = clap::value_parser!(u64).range(1..=1_000_000_000))]
     max_image_pixels: u64,
@@ -361,11 +357,7 @@ impl Serve {
             encoders: (!self.encoders.is_empty()).then(|| {
                 ImageEncoders {
                     models: self.encoders.clone(),
-                    runtime: Runtime {
-                        kind: self.runtime,
-                        threads,
-                        library: self.library.clone(),
-                    },
+                    runtime: self.models.with_threads(threads),
                     bounds: Bounds {
                         // An image is part of one message, so it cannot be larger.
                         bytes: self.max_message_bytes as u64,

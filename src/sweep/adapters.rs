@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, ensure};
 use clap::Args;
 use rayon::prelude::*;
 use serde_json::json;
@@ -13,6 +13,7 @@ use super::super::output::{JsonOutput, say, write_file};
 use super::super::progress::bar;
 use super::super::protocol::ProtocolOptions;
 use super::super::rooms::{data, load_rooms};
+use super::super::shard::Shard;
 use super::journal::{self, SweepJournal};
 use crate::table_files::TableFiles;
 use seese3_core::adapter::{Loss, TrainConfig};
@@ -64,7 +65,7 @@ pub struct Adapters {
     sample_seed: u64,
     /// Run only shard I of N, to distribute a sweep over jobs: 1/4 to 4/4
     #[arg(long, value_name = "I/N", default_value = "1/1")]
-    shard: String,
+    shard: Shard,
     /// Folder of the results; runs that it already holds are not repeated
     #[arg(long)]
     out: PathBuf,
@@ -85,7 +86,7 @@ impl Adapters {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
         self.files.begin()?;
-        let (part, parts) = self.shard()?;
+        let Shard { part, parts } = self.shard;
         self.protocol.needs_test_pairs()?;
         self.protocol.leaves_to_the_grid()?;
         ensure!(
@@ -120,12 +121,8 @@ impl Adapters {
 
         // The full list is cut into shards before finished runs are dropped: shards never overlap,
         // whatever has been done already.
-        let ours: Vec<Task<'_>> = tasks
-            .into_iter()
-            .skip(part - 1)
-            .step_by(parts)
-            .filter(|task| !known.contains(&task.row.key))
-            .collect();
+        let mut ours = self.shard.tasks(tasks);
+        ours.retain(|task| !known.contains(&task.row.key));
         say(format_args!(
             "{} combinations of room and features; {all} runs, {} of them to be done here (shard {part} of {parts})",
             rooms.len(),
@@ -211,18 +208,6 @@ impl Adapters {
         }
 
         Ok(())
-    }
-
-    fn shard(&self) -> anyhow::Result<(usize, usize)> {
-        let parts = self
-            .shard
-            .split_once('/')
-            .and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
-
-        match parts {
-            Some((part, parts)) if (1..=parts).contains(&part) => Ok((part, parts)),
-            _ => bail!("--shard is I/N with I from 1 to N, got '{}'", self.shard),
-        }
     }
 
     /// Every run of the grid. The order depends only on the rooms and the arguments, so that all

@@ -31,7 +31,8 @@ impl Place {
             .args(arguments.split_whitespace())
             .current_dir(self.0.path())
             .env_remove("SEESE3_STORE")
-            .env_remove("SEESE3_RUNTIME");
+            .env_remove("SEESE3_RUNTIME")
+            .env_remove("SEESE3_DEVICE");
         program
     }
 

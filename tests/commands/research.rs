@@ -172,7 +172,8 @@ fn a_cut_or_sharded_sweep_gives_the_same_rows() {
     let parquet = fs::read(here.file("shards/runs.parquet")).unwrap();
     assert!(parquet.starts_with(b"PAR1") && parquet.ends_with(b"PAR1"));
 
-    here.refuses(&sweep("shards", "4/3"), &["--shard", "4/3"]);
+    let beyond = here.run(&sweep("shards", "4/3"));
+    assert_eq!(beyond.status.code(), Some(2), "a wrong option");
     here.refuses(&format!("{shards} --lr 0.1"), &["--lr", "--lrs"]);
     here.refuses(&format!("{shards} --split whole"), &["--split whole"]);
 

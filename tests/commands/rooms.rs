@@ -172,6 +172,46 @@ fn a_suite_is_drawn_once_and_encodes_as_its_images_do() {
     assert_eq!((picture.width(), picture.height()), (480, 120));
 }
 
+/// Oracle: the definition of shards, which divide the rooms; a room that fails is named, and the
+/// others are encoded.
+#[test]
+fn shards_encode_all_rooms_and_a_failure_stops_only_its_room() {
+    let here = Place::new();
+    here.succeeds("studio --store store --rooms 3 --frames 24 --seed 3 --keep-images");
+    let encode = "encode --store store --room studio3-* --encoder pixels";
+
+    let beyond = here.run(&format!("{encode} --shard 3/2"));
+    assert_eq!(beyond.status.code(), Some(2), "a wrong option");
+    here.refuses(&format!("{encode} --images ."), &["--images", "3 rooms"]);
+    here.prints(
+        &format!("{encode} --shard 2/2"),
+        &["1 rooms to encode here"],
+    );
+    let names = ["studio3-0000", "studio3-0001", "studio3-0002"];
+    let stored = |name: &str| here.succeeds(&format!("store show --store store rooms/{name}"));
+    assert_eq!(
+        names.map(|name| stored(name).contains("pixels")),
+        [false, true, false]
+    );
+
+    let bad = here.file("store/images/studio3-0000/frame-000003.png");
+    std::fs::write(&bad, "no image").unwrap();
+    let all = format!("{encode} --json encoded.json");
+    here.refuses(&all, &["1 of 3 rooms failed"]);
+    assert!(stored(names[2]).contains("pixels"));
+    let written = here.json("encoded.json");
+    assert_eq!(written["failed"][0]["room"], names[0]);
+    let problem = written["failed"][0]["problem"].as_str().unwrap();
+    assert!(problem.contains("frame-000003.png"), "{problem}");
+    let counts: Vec<u64> = written["rooms"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|room| room["encoded_count"].as_u64().unwrap())
+        .collect();
+    assert_eq!(counts, [0, 24], "the other shard had encoded one of them");
+}
+
 /// Oracle: the promise of the help: a corrupt image is named and stops; it is skipped and counted
 /// when asked; what was done before stays done.
 #[test]

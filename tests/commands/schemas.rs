@@ -94,6 +94,7 @@ fn commands_write_the_documented_json() {
     here.succeeds("studio --store store --rooms 1 --frames 24 --seed 3 --keep-images");
     writes("check --store store --room studio3-0000");
     writes("encode --store store --room studio3-0000 --encoder pixels");
+    writes("encode --store store --room studio3-* --encoder pixels --prefix again");
     writes(&Place::import("r", "synthetic"));
     writes("train --store store --room r --epochs 2 --name base");
     writes("train --store store --room r --epochs 1 --seeds 2");

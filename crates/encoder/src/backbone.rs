@@ -141,6 +141,16 @@ fn runner(
 ) -> Result<Box<dyn Runner>, Error> {
     match runtime.kind {
         #[cfg(feature = "onnx")]
+        RuntimeKind::Tract if runtime.device != super::Device::Cpu => Err(Error::Runtime {
+            runtime: RuntimeKind::Tract.name(),
+            problem: format!(
+                "runs on the CPU only; for device {}, choose the runtime {}",
+                runtime.device,
+                RuntimeKind::OnnxRuntime.name()
+            )
+            .into(),
+        }),
+        #[cfg(feature = "onnx")]
         RuntimeKind::Tract => Ok(Box::new(super::tract::Tract::open(file, names, shape)?)),
         #[cfg(feature = "onnxruntime")]
         RuntimeKind::OnnxRuntime => Ok(Box::new(super::onnxruntime::OnnxRuntime::open(

@@ -53,7 +53,7 @@ pub use preprocess::Preprocess;
 pub use preprocess_file::read_preprocess_file;
 pub use recipes::{EncoderRecipe, RECIPES, RunWeights, recipe};
 pub use run::{Encoded, Kept, OnBadImage, Task, encode_room};
-pub use runtime::{Runtime, RuntimeKind};
+pub use runtime::{Device, Runtime, RuntimeKind};
 pub use thumbnail::thumbnail;
 
 use std::path::{Path, PathBuf};

@@ -6,11 +6,12 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use ndarray::{ArrayD, Axis, Slice};
 use ort::environment::Environment;
+use ort::ep::CUDA;
 use ort::session::Session;
 use ort::value::TensorRef;
 
 use super::model_file::ModelFile;
-use super::runtime::{Runner, Runtime};
+use super::runtime::{Device, Runner, Runtime};
 use super::{Error, RuntimeKind};
 
 const NAME: &str = "onnxruntime";
@@ -50,6 +51,12 @@ impl OnnxRuntime {
             .map_err(|error| failed(&error))?
             .with_config_entry(SPINNING, "0")
             .map_err(|error| failed(&error))?;
+        if let Device::Cuda(number) = runtime.device {
+            // Without this, a model runs on the CPU if the GPU cannot be used.
+            let cuda = CUDA::default().with_device_id(i32::from(number));
+            let registered = builder.with_execution_providers([cuda.build().error_on_failure()]);
+            builder = registered.map_err(|error| no_device(runtime, &error))?;
+        }
 
         // A model opened from memory needs this folder to find its external weights.
         let folder = file
@@ -167,6 +174,17 @@ fn environment(library: Option<&Path>) -> Result<&'static Environment, Error> {
     LOADED.get_or_init(load).as_ref().map_err(|problem| {
         failed(format!("{} cannot be loaded: {problem}; {help}", library.display()).into())
     })
+}
+
+fn no_device<T: std::fmt::Display>(runtime: &Runtime, error: &T) -> Error {
+    let library = runtime.library.as_deref().unwrap_or(Path::new(""));
+    let problem = format!(
+        "device {} cannot be used: {error}; it needs a library with CUDA (`pip install onnxruntime-gpu`; {} was \
+         loaded), CUDA and cuDNN on the library path, and that GPU",
+        runtime.device,
+        library.display()
+    );
+    failed(&problem)
 }
 
 fn failed<T: std::fmt::Display>(error: &T) -> Error {

@@ -15,6 +15,8 @@ use seese3_core::room::Room;
 const SHORT: f64 = 1e6;
 /// Cost limit of work that is done in place, products of coordinates: about 0.1 ms.
 const BRIEF: f64 = 4e6;
+/// Cost limit of a BatchNavigate in the lane for short requests, products of coordinates: about 10 ms.
+const SHORT_BATCH: f64 = 100.0 * BRIEF;
 /// Products that take as long as choosing a frame among the nearest.
 const CHOICE: usize = 20;
 /// Maximum number of images of a request in the lane for images: a stereo pair.
@@ -39,16 +41,33 @@ impl Costs<'_> {
         }
     }
 
+    /// Lane of a BatchNavigate request.
+    pub fn batch_navigate(&self, requests: &[pb::NavigateRequest]) -> Lane {
+        let products_of = |request: &pb::NavigateRequest| {
+            let is_known = is_prepared(request) && image_count(&request.source) == 0;
+            let room = self.exact_room(&request.room).filter(|_| is_known)?;
+            let views = step_count(request) as f64;
+            Some(views * products(room.widest_latent(), room.summary.frame_count))
+        };
+        match requests.iter().map(products_of).sum::<Option<f64>>() {
+            Some(products) if products <= SHORT_BATCH => Lane::Short,
+            _ => Lane::Long,
+        }
+    }
+
     /// Lane of `views` views that are compared with the frames of a room, as latents. A room that is not in
     /// memory is read from the store, which may take any time.
     pub fn brief(&self, room: &str, views: f64) -> Lane {
-        let room = self.snapshot.rooms().get(room);
-        let is_brief =
-            |room: &&Arc<ServedRoom>| self.index == IndexKind::Exact && room.is_in_memory();
-        let Some(room) = room.filter(is_brief) else {
+        let Some(room) = self.exact_room(room) else {
             return Lane::Short;
         };
         brief_or_short(views * products(room.widest_latent(), room.summary.frame_count))
+    }
+
+    /// A room in memory that is searched exactly.
+    fn exact_room(&self, room: &str) -> Option<&Arc<ServedRoom>> {
+        let room = self.snapshot.rooms().get(room);
+        room.filter(|room| self.index == IndexKind::Exact && room.is_in_memory())
     }
 
     /// Lane of a Localize or Relocalize request.

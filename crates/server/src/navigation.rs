@@ -6,7 +6,6 @@ use super::convert;
 use super::cost::{check_batch, check_batch_pixels, frame_bytes, step_bytes, step_count};
 use super::memory::hold_for_answer;
 use super::snapshot::ServedNavigator;
-use super::workers::Lane;
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::navigation_service_server::NavigationService;
@@ -51,7 +50,7 @@ impl NavigationService for Handlers {
         let most = self.config.batch;
         self.unary(
             request,
-            |_, _| Lane::Long,
+            |costs, batch| costs.batch_navigate(&batch.requests),
             move |snapshot, request, cancel| {
                 check_batch(request.requests.iter().map(frames_requested), most, limits)?;
                 let sources = request.requests.iter();

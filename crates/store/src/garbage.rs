@@ -21,10 +21,10 @@ use tokio_stream::StreamExt;
 
 use super::format::{AdapterBody, RoomBody};
 use super::publication::GRACE;
-use super::{Error, Kind, Store, folder_of, gone_name, manifest, sha256};
+use super::{Error, Kind, Store, derived, folder_of, gone_name, manifest, sha256};
 
 /// The top-level folders of a store. Other files in the same location are never touched.
-const STORE_FOLDERS: [&str; 3] = ["rooms", "adapters", "defaults"];
+const STORE_FOLDERS: [&str; 4] = ["rooms", "adapters", "defaults", derived::FOLDER];
 
 /// Folder of the quarantines of a room or adapter.
 const QUARANTINES: &str = "quarantine";
@@ -119,9 +119,39 @@ impl Store {
                     .await?;
             }
         }
+        self.find_derived(before, &mut garbage).await?;
         self.find_unfinished(before, &mut garbage)?;
 
         Ok(garbage)
+    }
+
+    /// Finds what was derived from revisions that are gone.
+    async fn find_derived(
+        &self,
+        before: DateTime<Utc>,
+        garbage: &mut Garbage,
+    ) -> Result<(), Error> {
+        let files = self.listed(&Path::from(derived::FOLDER)).await?;
+        if files.is_empty() {
+            return Ok(());
+        }
+
+        match self.derived_names().await {
+            Ok(needed) => {
+                let is_garbage = |file: &&ObjectMeta| {
+                    file.last_modified <= before && !needed.contains(file.location.as_ref())
+                };
+                let found = files.iter().filter(is_garbage).map(GarbageFile::of);
+                garbage.files.extend(found);
+            }
+            Err(error @ (Error::Damaged { .. } | Error::Schema { .. })) => {
+                garbage
+                    .left_alone
+                    .push(format!("{}: {error}", derived::FOLDER));
+            }
+            Err(error) => return Err(error),
+        }
+        Ok(())
     }
 
     /// Removes what [`Store::find_garbage`] finds, except files that were rewritten or referenced

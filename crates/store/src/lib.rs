@@ -7,6 +7,7 @@
 //! rooms/NAME/revisions/000002.gone   a removed revision; its number is not reused
 //! adapters/NAME/…                    the same for an adapter
 //! defaults/000001.json               the operator's defaults, see [`Defaults`]
+//! derived/…                          what servers have derived from rooms, see [`Derived`]
 //! ```
 //!
 //! Tensors are safetensors files; Python reads them with `safetensors.numpy.load_file(path)`.
@@ -46,6 +47,7 @@ mod defaults;
 mod error_model;
 mod relational_reader;
 mod format;
+mod derived;
 mod room_files;
 mod verification;
 mod contents;
@@ -67,6 +69,7 @@ pub use foreign_adapter::{ForeignAdapter, read_foreign_adapter};
 
 pub use contents::{Contents, RevisionContents, Usage};
 pub use defaults::{Choice, Cleared, Defaults, StandingDefaults};
+pub use derived::{Derived, DerivedKey};
 pub use extension::{AddedPart, ExtendedRoom, OtherFeatures};
 pub use garbage::{Garbage, GarbageFile, GarbagePolicy, Publishers};
 pub use map_edits::EditedRoom;

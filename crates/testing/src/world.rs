@@ -10,16 +10,10 @@ use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
 use seese3_robot::calibration::calibrate;
 
+use crate::noise;
+
 pub const FRAMES: usize = 300;
 const COLUMNS: usize = 48;
-
-/// Deterministic noise in [-1, 1), from `seed` and `place`.
-fn noise(seed: u64, place: usize) -> f64 {
-    let mixed = (seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ place as u64)
-        .wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    ((mixed ^ (mixed >> 29)).wrapping_mul(0x94d0_49bb_1331_11eb) >> 40) as f64 / f64::from(1 << 23)
-        - 1.0
-}
 
 /// A synthetic room: a camera that sways and returns. Features are a linear function of the pose,
 /// plus a constant for the room and noise.

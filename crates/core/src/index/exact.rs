@@ -3,7 +3,7 @@
 
 use std::ops::Range;
 
-use ndarray::{ArrayView2, Axis};
+use ndarray::{Array2, ArrayView2, Axis};
 
 use super::scores::{LANES, ScoredRows, Scores};
 use super::{Exclusion, Index, Nearest, Neighbor, distance};
@@ -33,14 +33,25 @@ impl ExactIndex {
         let mut frames = frames.to_vec();
         frames.sort_unstable();
         let rows: Vec<usize> = frames.iter().map(|frame| frame.row()).collect();
-        let latents = latents.select(Axis(0), &rows);
+        Self::of_frames(latents.select(Axis(0), &rows).view(), &frames)
+    }
 
+    /// Indexes the rows of `latents` (n, k), one for each of `frames`, which are in ascending order.
+    pub fn of_frames(latents: ArrayView2<'_, f64>, frames: &[FrameId]) -> Self {
         Self {
-            frames,
+            frames: frames.to_vec(),
             width: latents.ncols(),
-            rows: ScoredRows::new(latents.view()),
-            values: latents.into_iter().collect(),
+            rows: ScoredRows::new(latents),
+            values: latents.iter().copied().collect(),
         }
+    }
+
+    /// The indexed rows in the order of their frames, shape (n, k).
+    pub fn rows(&self) -> Array2<f64> {
+        let shape = (self.frames.len(), self.width);
+        Array2::from_shape_fn(shape, |(row, column)| {
+            self.values[row * self.width + column]
+        })
     }
 
     /// The nearest of some queries that are compared with all rows in one pass.
@@ -106,6 +117,12 @@ impl ExactIndex {
             frame: self.frames[position],
             distance: distance(row, query),
         }
+    }
+
+    /// The indexed row of a frame, shape (k,); `None` if the frame is not indexed.
+    pub fn row(&self, frame: FrameId) -> Option<&[f64]> {
+        let position = self.frames.binary_search(&frame).ok()?;
+        self.values.get(position * self.width..)?.get(..self.width)
     }
 
     /// The positions of the excluded frames.

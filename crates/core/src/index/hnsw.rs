@@ -10,7 +10,7 @@ use std::collections::BTreeSet;
 use hnsw_rs::prelude::{DistL2, Hnsw};
 use ndarray::ArrayView2;
 
-use super::{Audit, ExactIndex, Exclusion, Index, Neighbor, by_distance_then_frame, distance};
+use super::{Audit, ExactIndex, Exclusion, Index, Neighbor, distance};
 use crate::room::FrameId;
 
 const MOST_LAYERS: usize = 16;
@@ -172,7 +172,7 @@ impl Index for HnswIndex {
             })
             .collect();
 
-        neighbors.sort_by(by_distance_then_frame);
+        neighbors.sort_by(Neighbor::nearer);
         neighbors.truncate(k);
 
         if neighbors.len() < k.min(self.frames.len()) {

@@ -90,11 +90,12 @@ pub trait Index: Send + Sync {
     }
 }
 
-/// The order of results: by distance, then by frame.
-fn by_distance_then_frame(a: &Neighbor, b: &Neighbor) -> std::cmp::Ordering {
-    a.distance
-        .total_cmp(&b.distance)
-        .then(a.frame.cmp(&b.frame))
+impl Neighbor {
+    /// The order of results: by distance, then by frame.
+    pub fn nearer(&self, other: &Self) -> std::cmp::Ordering {
+        let by_distance = self.distance.total_cmp(&other.distance);
+        by_distance.then(self.frame.cmp(&other.frame))
+    }
 }
 
 /// L2 distance. Columns are summed in four SIMD lanes in a fixed order, so that equal rows have
@@ -144,7 +145,7 @@ impl Nearest {
     }
 
     fn insert(&mut self, found: Neighbor) {
-        let is_before = |other: &Neighbor| by_distance_then_frame(other, &found).is_lt();
+        let is_before = |other: &Neighbor| other.nearer(&found).is_lt();
         let place = self.best.partition_point(is_before);
         self.best.insert(place, found);
         self.best.truncate(self.count);

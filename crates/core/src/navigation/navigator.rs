@@ -107,17 +107,36 @@ impl Navigator {
         kind: IndexKind,
     ) -> Result<Self, Error> {
         adapter.check_source(features.source())?;
+        let latents = adapter.embed(features.rows())?;
+        Self::of_latents(room, features, adapter, kind, latents)
+    }
+
+    /// As [`Navigator::new`], with latents (n, k) that were computed before from the same features and adapter.
+    ///
+    /// # Errors
+    /// As [`Navigator::new`]; [`Error::FeatureRows`] also for another number of latents.
+    pub fn of_latents(
+        room: Arc<Room>,
+        features: &Features,
+        adapter: Arc<Adapter>,
+        kind: IndexKind,
+        latents: Array2<f64>,
+    ) -> Result<Self, Error> {
+        adapter.check_source(features.source())?;
+        for latent in latents.outer_iter().take(1) {
+            adapter.check_latent(&latent.to_vec())?;
+        }
         let frame_count = room.frame_count();
-        let rows = features.rows().nrows();
-        if rows != frame_count {
-            return Err(Error::FeatureRows {
-                room: room.id().clone(),
-                frame_count,
-                rows,
-            });
+        for rows in [features.rows().nrows(), latents.nrows()] {
+            if rows != frame_count {
+                return Err(Error::FeatureRows {
+                    room: room.id().clone(),
+                    frame_count,
+                    rows,
+                });
+            }
         }
 
-        let latents = adapter.embed(features.rows())?;
         let search = Search::new(kind, RetrievalMetric::Full, &adapter, latents.view())?;
         let cells = match adapter.relational() {
             Some(reader) => Some(reader.cells(features.rows())?),

@@ -8,8 +8,8 @@ use safetensors::SafeTensors;
 use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
 use seese3_encoder::{
-    Bounds, Encoder, Error, Filter, Layer, ModelTask, Preparation, Resize, Runtime, RuntimeKind,
-    decode, normalized, read_image, recipe,
+    Bounds, Device, Encoder, Error, Filter, Layer, ModelTask, Preparation, Resize, Runtime,
+    RuntimeKind, decode, normalized, read_image, recipe,
 };
 use seese3_testing::{Tensors, golden, json, npy, number, shared};
 
@@ -29,6 +29,7 @@ fn runtimes() -> Vec<Runtime> {
             kind,
             threads: 2,
             library: library.clone(),
+            device: Device::Cpu,
         })
         .collect();
 
@@ -334,6 +335,7 @@ fn an_encoder_is_built_again_from_what_its_features_say() {
             kind,
             threads: 1,
             library: None,
+            device: Device::Cpu,
         };
 
         let task = tiny_layer("image.onnx", "map", "mean");
@@ -347,6 +349,28 @@ fn an_encoder_is_built_again_from_what_its_features_say() {
             ),
             Ok(_) => assert!(kind == RuntimeKind::Tract && kind.is_built()),
         }
+    }
+}
+
+/// Oracle: the contract: a device that the runtime cannot use is an error, never another device.
+#[test]
+#[cfg_attr(
+    not(any(feature = "onnx", feature = "onnxruntime")),
+    ignore = "built without a runtime of models"
+)]
+fn a_device_that_cannot_be_used_is_refused() {
+    for runtime in runtimes() {
+        // A machine of the tests has fewer GPUs, or none.
+        let device = Device::Cuda(999);
+        let expected = match runtime.kind {
+            RuntimeKind::Tract => "runs on the CPU only; for device cuda:999",
+            RuntimeKind::OnnxRuntime => "device cuda:999 cannot be used",
+        };
+        let runtime = Runtime { device, ..runtime };
+        refused(
+            Encoder::model(tiny_layer("image.onnx", "map", "mean"), &runtime),
+            expected,
+        );
     }
 }
 

@@ -167,6 +167,16 @@ impl Appearance {
         Some(Self { mean, components })
     }
 
+    /// The mean, shape (d,), and the scaled components, shape (c, d).
+    pub fn parts(&self) -> (&Array1<f64>, &Array2<f64>) {
+        (&self.mean, &self.components)
+    }
+
+    /// The PCA of [`Appearance::parts`]; `None` if the shapes differ.
+    pub fn of_parts(mean: Array1<f64>, components: Array2<f64>) -> Option<Self> {
+        (components.ncols() == mean.len()).then_some(Self { mean, components })
+    }
+
     /// Coordinates of a feature of shape (d,).
     pub fn coordinates(&self, feature: &[f32]) -> Array1<f64> {
         let mut row: Array1<f64> = feature.iter().copied().map(f64::from).collect();

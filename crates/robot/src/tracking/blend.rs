@@ -14,7 +14,7 @@ use seese3_core::adapter::ErrorModel;
 use seese3_core::geometry::{Pose, Twist, body_twist, exp};
 use seese3_core::index::{Nearest, Neighbor, distance};
 use seese3_core::navigation::Navigator;
-use seese3_core::room::FrameId;
+use seese3_core::room::{FrameId, Timeline};
 use seese3_core::statistics::robust_covariance;
 
 /// Number of blended frames.
@@ -173,6 +173,26 @@ impl ViewErrors {
 }
 
 impl BlendErrors {
+    /// How many numbers [`BlendErrors::to_numbers`] gives.
+    pub const NUMBERS: usize = 5 + 1 + 36;
+
+    /// The coefficients, the largest size, and the shape row by row.
+    pub fn to_numbers(&self) -> Vec<f64> {
+        let shape = self.shape.transpose();
+        let largest = std::iter::once(&self.largest);
+        let numbers = self.coefficients.iter().chain(largest).chain(&shape);
+        numbers.copied().collect()
+    }
+
+    /// The errors of [`BlendErrors::to_numbers`]; `None` for another number of numbers.
+    pub fn of_numbers(numbers: &[f64]) -> Option<Self> {
+        (numbers.len() == Self::NUMBERS).then(|| Self {
+            coefficients: Vector5::from_column_slice(&numbers[..5]),
+            largest: numbers[5],
+            shape: Matrix6::from_row_slice(&numbers[6..]),
+        })
+    }
+
     /// Fits the errors of a room. `None` if too few frames are mapped.
     pub fn measured(
         navigator: &Navigator,
@@ -258,13 +278,15 @@ pub struct Likeness<'a> {
 
 /// Distances of all mapped frames from one of them.
 fn distances_from(coordinates: &Array2<f64>, mapped: &[FrameId], frame: FrameId) -> Vec<Neighbor> {
-    // Rows of an array in standard layout are slices.
     let coordinates = coordinates.as_standard_layout();
-    let row = |frame: FrameId| coordinates.row(frame.row()).to_slice().unwrap_or_default();
+    let width = coordinates.ncols();
+    let values = coordinates.as_slice().unwrap_or_default();
+    let row = |frame: FrameId| &values[frame.row() * width..][..width];
 
+    let here = row(frame);
     let of = |&other: &FrameId| Neighbor {
         frame: other,
-        distance: distance(row(other), row(frame)),
+        distance: distance(row(other), here),
     };
     mapped.iter().map(of).collect()
 }
@@ -285,40 +307,106 @@ fn blends_without(
         .second_opinion
         .map(|coordinates| distances_from(coordinates, mapped, frame));
 
-    let timeline = navigator.room().timeline();
-    let rounds = LEFT_OUT_ROWS.map(Some).into_iter().chain([None]);
-    let found = |rows: Option<u32>| {
-        let is_left = |other: &&Neighbor| match rows {
-            Some(rows) => other.frame.0.abs_diff(frame.0) > rows,
-            None => !timeline.joins(other.frame, frame),
-        };
-        let left = |distances: &[Neighbor]| -> Option<Vec<Neighbor>> {
-            let mut nearest = Nearest::new(LOOKED_AT);
-            for other in distances.iter().filter(is_left) {
-                nearest.offer(*other);
-            }
-            let left = nearest.found();
-            (left.len() == LOOKED_AT).then_some(left)
-        };
+    let left =
+        |distances: &[Neighbor]| left_by_round(navigator.room().timeline(), distances, frame);
+    let nearest = left(&distances);
+    let nearest_unseen = distances_unseen.as_deref().map(left);
+    let nearest_by_second = second.as_deref().map(left);
 
+    let found = |round: usize| {
         // Use the full PCA while neighbors remain in the map; otherwise the PCA without the frame's
         // fold.
-        let is_unseen = rows.is_none_or(|rows| rows >= UNSEEN_ROWS);
-        let distances = match &distances_unseen {
-            Some(distances_unseen) if is_unseen => distances_unseen,
-            _ => &distances,
+        let rows = LEFT_OUT_ROWS.get(round);
+        let is_unseen = rows.is_none_or(|&rows| rows >= UNSEEN_ROWS);
+        let nearest = match &nearest_unseen {
+            Some(unseen) if is_unseen => unseen,
+            _ => &nearest,
         };
+        let enough = |left: &Vec<Neighbor>| left.len() == LOOKED_AT;
 
-        let second = second
-            .as_deref()
-            .and_then(left)
-            .map(|left| Blend::of(navigator, &left, None).pose);
-        let blend = Blend::of(navigator, &left(distances)?, second.as_ref());
+        let second = nearest_by_second.as_ref().map(|by_round| &by_round[round]);
+        let second = second.filter(|left| enough(left));
+        let second = second.map(|left| Blend::of(navigator, left, None).pose);
+        let left = Some(&nearest[round]).filter(|left| enough(left))?;
+        let blend = Blend::of(navigator, left, second.as_ref());
         let error = body_twist(&blend.pose, &navigator.room().poses()[frame.row()]);
         let is_known = error.is_unique_logarithm();
         let error = error.to_vector();
         is_known.then_some(LeftOut { blend, error })
     };
 
-    rounds.filter_map(found).collect()
+    (0..=LEFT_OUT_ROWS.len()).filter_map(found).collect()
+}
+
+/// The [`LOOKED_AT`] nearest frames of each round of [`LEFT_OUT_ROWS`], and of the round without the sequence of
+/// `frame`; fewer if fewer are left.
+fn left_by_round(
+    timeline: &Timeline,
+    distances: &[Neighbor],
+    frame: FrameId,
+) -> Vec<Vec<Neighbor>> {
+    // Each of the first rounds leaves out frames of a window, so that its nearest are among as many frames more.
+    let most_left_out = 2 * LEFT_OUT_ROWS.iter().copied().max().unwrap_or(0) as usize + 1;
+    let mut near = distances.to_vec();
+    let count = LOOKED_AT + most_left_out;
+    if count < near.len() {
+        near.select_nth_unstable_by(count, Neighbor::nearer);
+        near.truncate(count);
+    }
+    near.sort_unstable_by(Neighbor::nearer);
+
+    let rounds = LEFT_OUT_ROWS.iter().map(|&rows| {
+        let is_left = |other: &&Neighbor| other.frame.0.abs_diff(frame.0) > rows;
+        near.iter()
+            .filter(is_left)
+            .take(LOOKED_AT)
+            .copied()
+            .collect()
+    });
+    let mut elsewhere = Nearest::new(LOOKED_AT);
+    for other in distances {
+        if !timeline.joins(other.frame, frame) {
+            elsewhere.offer(*other);
+        }
+    }
+    rounds.chain([elsewhere.found()]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: the definition: the nearest of the frames that a round leaves.
+    #[test]
+    fn each_round_has_the_nearest_of_what_it_leaves() {
+        for count in [3, 10, 245, 246, 400] {
+            let timeline = Timeline {
+                frame_count: count,
+                sequences: (0..count).map(|row| (row / 150) as u32).collect(),
+                held_out: Vec::new(),
+            };
+            // Many distances are equal.
+            let distances: Vec<Neighbor> = (0..count)
+                .map(|row| Neighbor {
+                    frame: FrameId(row as u32),
+                    distance: ((row * 7919) % 31) as f64,
+                })
+                .collect();
+
+            for frame in [0, count / 2, count - 1].map(|row| FrameId(row as u32)) {
+                let found = left_by_round(&timeline, &distances, frame);
+                let rounds = LEFT_OUT_ROWS.map(Some).into_iter().chain([None]);
+                for (rows, found) in rounds.zip(found) {
+                    let mut expected = distances.clone();
+                    expected.retain(|other| match rows {
+                        Some(rows) => other.frame.0.abs_diff(frame.0) > rows,
+                        None => !timeline.joins(other.frame, frame),
+                    });
+                    expected.sort_by(Neighbor::nearer);
+                    expected.truncate(LOOKED_AT);
+                    assert_eq!(found, expected, "{count} frames, {frame:?}, {rows:?}");
+                }
+            }
+        }
+    }
 }

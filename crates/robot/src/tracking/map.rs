@@ -2,14 +2,14 @@
 
 use std::sync::Arc;
 
-use ndarray::{Array2, ArrayView1, ArrayView2, Axis, s};
+use ndarray::{Array1, Array2, ArrayView1, ArrayView2, Axis, s};
 
 use super::appearance::{Appearance, COMPONENTS, RoomAppearance};
 use super::blend::{Blend, BlendErrors, LOOKED_AT, Likeness, ViewErrors};
 use super::clock::frame_period_s;
 use super::{Error, PoseWithCovariance};
 use seese3_core::adapter::{ErrorModel, TEMPORAL_NEIGHBORS};
-use seese3_core::index::{ExactIndex, Exclusion, Index, Neighbor};
+use seese3_core::index::{ExactIndex, Exclusion, Index, Neighbor, distance};
 use seese3_core::navigation::Navigator;
 use seese3_core::room::{FrameId, Room};
 use seese3_core::statistics::median;
@@ -77,6 +77,41 @@ pub struct Map {
     by_appearance: Option<AppearanceMap>,
 }
 
+/// What a map derives from the latents and features of its frames. It takes most of the time of making a
+/// map, and can be kept.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MapTables {
+    /// The typical distance between views when a camera returns to a place, in standard deviations of
+    /// frame noise.
+    pub typical_distance: f64,
+    /// Errors of poses by latent, as many numbers as [`MapTables::ERRORS`]; `None` if too few frames are
+    /// mapped.
+    pub errors: Option<Vec<f64>>,
+    /// Retrieval by feature, if there is any.
+    pub by_feature: Option<FeatureTables>,
+}
+
+/// The part of [`MapTables`] for retrieval by feature.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FeatureTables {
+    /// Mean of the features at length 1, shape (d,).
+    pub mean: Array1<f64>,
+    /// Scaled components, shape (c, d).
+    pub components: Array2<f64>,
+    /// Coordinates of the mapped frames, in order, shape (m, c).
+    pub coordinates: Array2<f64>,
+    /// Errors of poses with and without a latent in distribution, each as many numbers as
+    /// [`MapTables::ERRORS`].
+    pub errors: [Vec<f64>; 2],
+}
+
+impl MapTables {
+    /// The version of the computation. It changes with any change of a result.
+    pub const VERSION: u32 = 1;
+    /// Numbers of the errors of poses.
+    pub const ERRORS: usize = BlendErrors::NUMBERS;
+}
+
 /// Match of a view with a map.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MapMatch {
@@ -107,18 +142,7 @@ impl Map {
     /// - [`Error::SmallMap`] if no mapped frame has a distinct one outside its temporal
     ///   neighborhood.
     pub fn new(navigator: Arc<Navigator>, mapped: &[FrameId]) -> Result<Self, Error> {
-        let error_model = navigator
-            .adapter()
-            .error_model()
-            .ok_or(Error::NotCalibrated)?
-            .clone();
-
-        // Distances in standard deviations of frame noise are comparable between rooms and
-        // adapters.
-        let coordinates = s![.., ..navigator.adapter().coordinate_count()];
-        let whitened = error_model
-            .frame_noise()
-            .whitened(navigator.latents().slice(coordinates));
+        let (error_model, whitened) = whitened_latents(&navigator)?;
         let index = ExactIndex::new(whitened.view(), mapped);
 
         // The temporal neighborhood covers the same time as in the calibration rooms.
@@ -151,6 +175,64 @@ impl Map {
             pose_reader: None,
             by_appearance: None,
         })
+    }
+
+    /// The map that gave these tables, of the same navigator and mapped frames. `None` if they do not fit.
+    ///
+    /// # Errors
+    /// [`Error::NotCalibrated`] if the adapter has no error model.
+    pub fn of_tables(
+        navigator: Arc<Navigator>,
+        mapped: &[FrameId],
+        tables: MapTables,
+    ) -> Result<Option<Self>, Error> {
+        let (error_model, whitened) = whitened_latents(&navigator)?;
+        let errors_of = |numbers: &Vec<f64>| BlendErrors::of_numbers(numbers);
+        let by_appearance = |tables: FeatureTables| {
+            let [with_latent, without_latent] = &tables.errors;
+            let is_fit = tables.coordinates.dim() == (mapped.len(), tables.components.nrows());
+            Some(AppearanceMap {
+                index: ExactIndex::of_frames(tables.coordinates.view(), mapped),
+                errors: ViewErrors {
+                    with_latent: errors_of(with_latent)?,
+                    without_latent: errors_of(without_latent)?,
+                },
+                appearance: Appearance::of_parts(tables.mean, tables.components)?,
+            })
+            .filter(|_| is_fit)
+        };
+
+        let errors = tables.errors.as_ref().map(errors_of);
+        let by_appearance = tables.by_feature.map(by_appearance);
+        let is_whole = !matches!(errors, Some(None)) && !matches!(by_appearance, Some(None));
+        Ok(is_whole.then(|| Self {
+            index: ExactIndex::new(whitened.view(), mapped),
+            typical_distance: tables.typical_distance,
+            errors: errors.flatten(),
+            by_appearance: by_appearance.flatten(),
+            navigator,
+            error_model,
+            pose_reader: None,
+        }))
+    }
+
+    /// What [`Map::of_tables`] makes this map of, without its localizer.
+    pub fn tables(&self) -> MapTables {
+        let by_feature = |map: &AppearanceMap| {
+            let (mean, components) = map.appearance.parts();
+            FeatureTables {
+                mean: mean.clone(),
+                components: components.clone(),
+                coordinates: map.index.rows(),
+                errors: [&map.errors.with_latent, &map.errors.without_latent]
+                    .map(BlendErrors::to_numbers),
+            }
+        };
+        MapTables {
+            typical_distance: self.typical_distance,
+            errors: self.errors.as_ref().map(BlendErrors::to_numbers),
+            by_feature: self.by_appearance.as_ref().map(by_feature),
+        }
     }
 
     /// Adds retrieval by raw feature. `features` has shape (n, d), `mapped` holds the mapped
@@ -272,16 +354,11 @@ impl Map {
         }
     }
 
-    /// The same frames with the distances of their latents from a whitened latent.
+    /// The same mapped frames with the distances of their latents from a whitened latent.
     fn with_latent_distances(&self, frames: &[Neighbor], whitened: &[f64]) -> Vec<Neighbor> {
-        let latents = self.navigator.latents();
-        let of_latent = |found: &Neighbor| {
-            let other = self.whitened(latents.row(found.frame.row()));
-            let squares = whitened.iter().zip(other).map(|(a, b)| (a - b).powi(2));
-            Neighbor {
-                frame: found.frame,
-                distance: squares.sum::<f64>().sqrt(),
-            }
+        let of_latent = |found: &Neighbor| Neighbor {
+            frame: found.frame,
+            distance: distance(self.index.row(found.frame).unwrap_or_default(), whitened),
         };
         frames.iter().map(of_latent).collect()
     }
@@ -295,6 +372,18 @@ impl Map {
             .row(0)
             .to_vec()
     }
+}
+
+/// The error model of a navigator's adapter, and the latents in standard deviations of frame noise, which
+/// are comparable between rooms and adapters.
+fn whitened_latents(navigator: &Navigator) -> Result<(Arc<ErrorModel>, Array2<f64>), Error> {
+    let adapter = navigator.adapter();
+    let error_model = adapter.error_model().ok_or(Error::NotCalibrated)?.clone();
+    let coordinates = s![.., ..adapter.coordinate_count()];
+    let whitened = error_model
+        .frame_noise()
+        .whitened(navigator.latents().slice(coordinates));
+    Ok((error_model, whitened))
 }
 
 /// Median distance from a mapped frame to its nearest mapped frame more than `neighbors` rows

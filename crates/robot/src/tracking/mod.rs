@@ -19,7 +19,7 @@ mod view;
 
 pub use clock::{ASSUMED_PERIOD_S, frame_period_s, seconds_between};
 pub(crate) use map::extent_m;
-pub use map::{Map, MapMatch, MapQuery, PoseReader};
+pub use map::{FeatureTables, Map, MapMatch, MapQuery, MapTables, PoseReader};
 pub use measured_pose::{Drift, MeasuredPose, OdometryDelta};
 pub use motion_prior::MotionPrior;
 pub(crate) use pose_with_covariance::PLACE_DEVIATION_M;

@@ -567,3 +567,46 @@ fn wheels_carry_a_blind_camera() {
         "a blind camera is not TRACKING"
     );
 }
+
+/// Oracle: the contract: the map of kept tables answers as the map that gave them, and tables of
+/// another room do not fit.
+#[test]
+fn a_map_of_tables_answers_as_the_first() {
+    let (room, features) = served("hall");
+    let adapter = Arc::new(calibrated().0);
+    let mapped: Vec<FrameId> = (0..FRAMES as u32).map(FrameId).collect();
+    let navigator = Navigator::new(Arc::new(room), &features, adapter, IndexKind::Exact).unwrap();
+    let navigator = Arc::new(navigator);
+    let map = Map::new(navigator.clone(), &mapped).unwrap();
+    let alone = map.tables();
+    let map = map.with_features(features.rows(), &mapped);
+    let tables = map.tables();
+    assert!(alone.by_feature.is_none() && tables.by_feature.is_some());
+
+    let again = |tables| Map::of_tables(navigator.clone(), &mapped, tables).unwrap();
+    let by_latent = again(alone).unwrap();
+    let by_feature = again(tables.clone()).unwrap();
+    for row in [0, 17, 150, 299] {
+        let feature = features.rows().row(row).to_vec();
+        let latent = navigator.latents().row(row).to_owned();
+        let query = |feature| MapQuery {
+            latent: latent.view(),
+            feature,
+        };
+        let expected = map.match_view(query(Some(&feature)), 5);
+        assert_eq!(by_feature.match_view(query(Some(&feature)), 5), expected);
+        let expected = map.match_view(query(None), 5);
+        assert_eq!(by_latent.match_view(query(None), 5), expected);
+    }
+
+    let mut other = tables.clone();
+    other.errors = Some(vec![0.0; 3]);
+    assert!(again(other).is_none());
+    let mut other = tables;
+    let of_feature = other.by_feature.as_mut().unwrap();
+    of_feature.coordinates = of_feature
+        .coordinates
+        .slice(ndarray::s![1.., ..])
+        .to_owned();
+    assert!(again(other).is_none());
+}

@@ -5,6 +5,7 @@ use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
 
 use futures_util::FutureExt;
+use ndarray::Array2;
 
 use super::Refusal;
 use super::content::Content;
@@ -19,7 +20,7 @@ use seese3_core::training::RoomData;
 use seese3_robot::fitting::{Localizer, RoomReader};
 use seese3_robot::localization::KeypointRoom;
 use seese3_robot::tracking::Map;
-use seese3_store::{RoomFit, Store, StoredAdapter, StoredRoom};
+use seese3_store::{Derived, RoomFit, Store, StoredAdapter, StoredRoom};
 
 /// Errors of loading a room, or one of its adapters.
 #[derive(Debug, thiserror::Error)]
@@ -217,16 +218,8 @@ impl RoomLoader {
         })?;
         let features: &Features = &features;
 
-        let navigator = Navigator::new(
-            (*room).clone(),
-            features,
-            adapter.adapter.clone(),
-            self.index,
-        )
-        .map_err(refused)?;
+        let (navigator, map) = self.navigator_and_map(loading, adapter, features).await?;
         log_audit(&navigator, &adapter.name);
-
-        let navigator = Arc::new(navigator);
         let trained_on = self
             .store
             .trained_on(&adapter.record, room.id(), stored.revision)
@@ -249,8 +242,13 @@ impl RoomLoader {
             _ => None,
         };
 
+        // If an adapter was fitted to the room, its reader locates the views of streams.
+        let map = map.map(|map| match &tracking_reader {
+            Some(fitted) => map.with_pose_reader(fitted.reader.clone()),
+            None => map,
+        });
         Ok(ServedNavigator {
-            map: map(&navigator, features, tracking_reader.as_ref()),
+            map: map.map(Arc::new),
             content: Content::of(&navigator),
             trained_on,
             reader,
@@ -261,6 +259,72 @@ impl RoomLoader {
             adapter: adapter.clone(),
             navigator,
         })
+    }
+
+    /// The navigator and the map of all frames, from what the store keeps or computed and then kept. There is no
+    /// map if the adapter is not calibrated, or, with a warning, if the room is too small for tracking.
+    async fn navigator_and_map(
+        &self,
+        loading: &LoadingRoom<'_>,
+        adapter: &StoredAdapter,
+        features: &Features,
+    ) -> Result<(Arc<Navigator>, Option<Map>), Problem> {
+        let LoadingRoom { stored, frames, .. } = loading;
+        let revision = stored.revision;
+        let key = self
+            .store
+            .derived_key(frames.id().as_str(), revision, adapter);
+        // Without a key, everything is computed.
+        let key = key.await.ok().flatten();
+        let kept = match &key {
+            Some(key) => self.store.load_derived(key).await,
+            None => None,
+        };
+
+        let new = |latents: Option<Array2<f64>>| {
+            let (room, adapter) = ((*frames).clone(), adapter.adapter.clone());
+            match latents {
+                Some(latents) => {
+                    Navigator::of_latents(room, features, adapter, self.index, latents)
+                }
+                None => Navigator::new(room, features, adapter, self.index),
+            }
+        };
+        let mapped: Vec<FrameId> = (0..frames.frame_count() as u32).map(FrameId).collect();
+        if let Some(Derived { latents, map }) = kept
+            && let Ok(navigator) = new(Some(latents))
+        {
+            let navigator = Arc::new(navigator);
+            let map = match map {
+                // Why there is no map is found and logged again.
+                None if navigator.adapter().error_model().is_some() => None,
+                None => Some(None),
+                Some(tables) => Map::of_tables(navigator.clone(), &mapped, tables)
+                    .ok()
+                    .flatten()
+                    .map(Some),
+            };
+            if let Some(map) = map {
+                return Ok((navigator, map));
+            }
+        }
+
+        let navigator = new(None).map_err(|problem| Problem::Navigator {
+            adapter: adapter.name.clone(),
+            problem,
+        })?;
+        let navigator = Arc::new(navigator);
+        let map = map(&navigator, features, &mapped);
+        if let Some(key) = &key {
+            let derived = Derived {
+                latents: navigator.latents().to_owned(),
+                map: map.as_ref().map(Map::tables),
+            };
+            if let Err(error) = self.store.keep_derived(key, &derived).await {
+                tracing::debug!(%error, "what was derived from a room is not kept");
+            }
+        }
+        Ok((navigator, map))
     }
 
     /// The reader of a fitted adapter, with its base as the second predictor.
@@ -311,27 +375,11 @@ fn log_audit(navigator: &Navigator, adapter: &str) {
     }
 }
 
-/// Builds the map of all frames of a room; `None` if the adapter is not calibrated, or, with a
-/// warning, if the room is too small for tracking. If an adapter was fitted to the room, its reader
-/// locates the views of streams.
-fn map(
-    navigator: &Arc<Navigator>,
-    features: &Features,
-    reader: Option<&Arc<FittedReader>>,
-) -> Option<Arc<Map>> {
+/// Computes the map of all frames of a room.
+fn map(navigator: &Arc<Navigator>, features: &Features, mapped: &[FrameId]) -> Option<Map> {
     navigator.adapter().error_model()?;
-    let frames: Vec<FrameId> = (0..navigator.room().frame_count() as u32)
-        .map(FrameId)
-        .collect();
-
-    match Map::new(navigator.clone(), &frames) {
-        Ok(map) => {
-            let map = map.with_features(features.rows(), &frames);
-            Some(Arc::new(match reader {
-                Some(fitted) => map.with_pose_reader(fitted.reader.clone()),
-                None => map,
-            }))
-        }
+    match Map::new(navigator.clone(), mapped) {
+        Ok(map) => Some(map.with_features(features.rows(), mapped)),
         Err(error) => {
             tracing::warn!(room = %navigator.room().id(), %error, "tracking is unavailable");
             None

@@ -13,7 +13,7 @@ use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan, train_adapter, train_reader};
 use seese3_encoder::{
-    Bounds, Encoder, Layer, ModelTask, Preparation, Resize, Runtime, RuntimeKind,
+    Bounds, Device, Encoder, Layer, ModelTask, Preparation, Resize, Runtime, RuntimeKind,
 };
 use seese3_server::{Config, ImageEncoders};
 use seese3_store::Store;
@@ -84,6 +84,7 @@ fn with_encoders(models: &[&str]) -> Config {
             kind: RuntimeKind::Tract,
             threads: 1,
             library: None,
+            device: Device::Cpu,
         },
         bounds: Bounds {
             bytes: 1 << 20,
@@ -229,6 +230,7 @@ fn two_grids() -> (String, Encoder) {
         kind: RuntimeKind::Tract,
         threads: 1,
         library: None,
+        device: Device::Cpu,
     };
     let encoder = Encoder::model(task, &runtime).unwrap();
     (file.to_str().unwrap().to_owned(), encoder)

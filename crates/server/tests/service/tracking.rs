@@ -872,3 +872,80 @@ async fn odometry_that_is_none_is_refused() {
         assert_eq!(heard[3], plain[2]);
     }
 }
+
+/// Oracle: the contract: a server that finds what another has derived answers as that one did, and a
+/// damaged file costs only time. That the file is used shows when it holds another room's distance.
+#[tokio::test]
+async fn what_is_derived_from_a_room_is_kept_in_the_store() {
+    let first = start_followed(Config::default()).await;
+    let location = first.folder.path().to_str().unwrap().to_owned();
+    let frames = || followed(config(), 0..20);
+    let expected = answers(&first, frames()).await.unwrap();
+    let TestServer {
+        folder,
+        stop,
+        ended,
+        ..
+    } = first;
+    stop.send(()).unwrap();
+    ended.await.unwrap().unwrap();
+
+    let store = Store::open(&location).unwrap();
+    let adapter = store.load_adapter("followed", None).await.unwrap();
+    let key = store
+        .derived_key("hall", 1, &adapter)
+        .await
+        .unwrap()
+        .unwrap();
+    let kept = store
+        .load_derived(&key)
+        .await
+        .expect("the first server kept it");
+    let files: Vec<_> = std::fs::read_dir(folder.path().join("derived"))
+        .unwrap()
+        .map(|file| file.unwrap().path())
+        .collect();
+    assert_eq!(files.len(), 2, "one for each room");
+
+    // The tokens of two servers differ.
+    let updates = |answers: &[pb::TrackResponse]| -> Vec<pb::TrackUpdate> {
+        answers[1..]
+            .iter()
+            .map(|answer| update(answer).clone())
+            .collect()
+    };
+    let expected = updates(&expected);
+    let novelty = |updates: &[pb::TrackUpdate]| {
+        let found = updates[5].r#match.as_ref().unwrap();
+        found.novelty.unwrap()
+    };
+    let mut other = kept.clone();
+    other.map.as_mut().unwrap().typical_distance *= 2.0;
+    let mut folder = Some(folder);
+    for (content, factor) in [(Some(&kept), 1.0), (Some(&other), 2.0), (None, 1.0)] {
+        match content {
+            Some(content) => store.keep_derived(&key, content).await.unwrap(),
+            None => {
+                for file in &files {
+                    std::fs::write(file, "damaged").unwrap();
+                }
+            }
+        }
+
+        let again = start_on(folder.take().unwrap(), store.clone(), Config::default()).await;
+        let found = updates(&answers(&again, frames()).await.unwrap());
+        if factor == 1.0 {
+            assert_eq!(found, expected);
+        } else {
+            assert!((novelty(&found) * factor - novelty(&expected)).abs() < 1e-9);
+        }
+        again.stop.send(()).unwrap();
+        again.ended.await.unwrap().unwrap();
+        folder = Some(again.folder);
+    }
+    assert_eq!(
+        store.load_derived(&key).await,
+        Some(kept),
+        "it was derived anew"
+    );
+}

@@ -10,10 +10,11 @@ use seese3_core::features::{FeatureSource, Features};
 use seese3_core::room::{FrameId, Room, RoomId};
 use seese3_core::training::RoomData;
 use seese3_robot::fitting::{FitRun, fit};
+use seese3_robot::tracking::{FeatureTables, MapTables};
 use seese3_store::fit_stored_room::{Error as FitError, Refit, Request};
 use seese3_store::{
-    Choice, Defaults, Error, GarbagePolicy, Publishers, Quota, Quotas, ResourceName, RoomFit,
-    Scope, Store,
+    Choice, Defaults, Derived, Error, GarbagePolicy, Publishers, Quota, Quotas, ResourceName,
+    RoomFit, Scope, Store,
 };
 
 use crate::dying::Dying;
@@ -774,4 +775,92 @@ async fn rounded_matrices_are_no_other_content() {
     let policy = seese3_store::UploadPolicy::Create;
     let published = store.upload_contents(contents, policy).await.unwrap();
     assert!(!published.is_new);
+}
+
+/// Oracle: the contract: what is kept comes back as it was or not at all, and is garbage once the
+/// room is gone.
+#[tokio::test]
+async fn what_is_derived_is_kept_while_its_room_is() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = Store::create(folder.path().to_str().unwrap()).unwrap();
+    let (hall, features) = world::served("hall");
+    let sets = std::slice::from_ref(&features);
+    store.publish_room(&hall, sets).await.unwrap();
+    let (adapter, record) = world::calibrated();
+    store
+        .publish_adapter("eyes", &adapter, &record, features.rows())
+        .await
+        .unwrap();
+    let adapter = store.load_adapter("eyes", None).await.unwrap();
+    let key = store.derived_key("hall", 1, &adapter).await.unwrap();
+    let key = key.expect("the room has the features");
+    assert_eq!(store.load_derived(&key).await, None);
+
+    // Equal numbers of another kind: with every part, and with none but the latents.
+    let numbers = |rows, columns| {
+        ndarray::Array2::from_shape_fn((rows, columns), |(i, j)| (i * 7 + j) as f64 / 3.0)
+    };
+    let errors = || {
+        numbers(1, MapTables::ERRORS)
+            .into_iter()
+            .collect::<Vec<_>>()
+    };
+    let with = |map| Derived {
+        latents: numbers(5, 2),
+        map,
+    };
+    let by_feature = FeatureTables {
+        mean: numbers(1, 4).into_iter().collect(),
+        components: numbers(3, 4),
+        coordinates: numbers(5, 3),
+        errors: [errors(), errors()],
+    };
+    for map in [
+        None,
+        Some(MapTables {
+            typical_distance: 0.5,
+            errors: None,
+            by_feature: None,
+        }),
+        Some(MapTables {
+            typical_distance: 0.5,
+            errors: Some(errors()),
+            by_feature: Some(by_feature),
+        }),
+    ] {
+        let derived = with(map);
+        store.keep_derived(&key, &derived).await.unwrap();
+        assert_eq!(store.load_derived(&key).await, Some(derived));
+    }
+
+    // Each altered or missing byte is noticed.
+    let [file] = files(folder.path(), "derived/")
+        .try_into()
+        .expect("one file");
+    let whole = std::fs::read(&file).unwrap();
+    for at in [0, 40, whole.len() - 1] {
+        let mut altered = whole.clone();
+        altered[at] ^= 1;
+        std::fs::write(&file, altered).unwrap();
+        assert_eq!(store.load_derived(&key).await, None, "byte {at}");
+        std::fs::write(&file, &whole[..at]).unwrap();
+        assert_eq!(store.load_derived(&key).await, None, "cut at {at}");
+    }
+    std::fs::write(&file, &whole).unwrap();
+
+    // Another revision of the frames or features is another key.
+    let other = features.select(&(0..100).collect::<Vec<_>>());
+    let cut = hall.frames().select(&(0..100).collect::<Vec<_>>());
+    let cut = Room::new(hall.id().clone(), cut, hall.provenance().clone()).unwrap();
+    store.publish_room(&cut, &[other]).await.unwrap();
+    assert_ne!(
+        store.derived_key("hall", 2, &adapter).await.unwrap(),
+        Some(key.clone())
+    );
+
+    store.collect_garbage(aged(Duration::ZERO)).await.unwrap();
+    assert!(store.load_derived(&key).await.is_some());
+    store.remove(&named("rooms/hall").at(1)).await.unwrap();
+    let garbage = store.collect_garbage(aged(Duration::ZERO)).await.unwrap();
+    assert!(!file.exists(), "{garbage:?}");
 }
