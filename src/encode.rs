@@ -11,7 +11,7 @@ use super::encoder::{EncoderOptions, RuntimeOptions, feature_prefix, say_feature
 use super::keypoints::{check_aspect, map_keypoints, mapping_inputs, room_keypoints};
 use super::output::say;
 use super::progress::bar;
-use super::rooms::room_names;
+use super::room_names::room_names;
 use super::shard::Shard;
 use super::store_option::StoreAndJson;
 use seese3_core::cancel::Cancellation;

@@ -15,9 +15,10 @@ mod table_files;
 mod encoder;
 mod pose_options;
 mod store_option;
+mod room_names;
+mod shard;
 #[cfg(feature = "lab")]
 mod rooms;
-mod shard;
 mod ask;
 mod encoders;
 mod export;
