@@ -110,7 +110,8 @@ impl Encode {
         }
     }
 
-    /// Encodes rooms one after the other, and writes the JSON record of all. A room that fails is listed.
+    /// Encodes rooms one after the other, and writes the JSON record of all. A room that fails is
+    /// listed.
     async fn encode_rooms(&self, job: &Job<'_>, rooms: Vec<String>) -> anyhow::Result<()> {
         let Shard { part, parts } = self.shard;
         say(format_args!(

@@ -57,7 +57,8 @@ struct Machine {
 struct Runtime {
     /// From the start of the command to the result, seconds.
     seconds: f64,
-    /// The runtime of the ONNX models, for example "tract" or "onnxruntime on cuda:0"; `None` if no model was opened.
+    /// The runtime of the ONNX models, for example "tract" or "onnxruntime on cuda:0"; `None` if no
+    /// model was opened.
     encoder: Option<String>,
 }
 

@@ -49,10 +49,7 @@ impl Costs<'_> {
             let views = step_count(request) as f64;
             Some(views * products(room.widest_latent(), room.summary.frame_count))
         };
-        match requests.iter().map(products_of).sum::<Option<f64>>() {
-            Some(products) if products <= SHORT_BATCH => Lane::Short,
-            _ => Lane::Long,
-        }
+        batch_lane(requests.iter().map(products_of))
     }
 
     /// Lane of `views` views that are compared with the frames of a room, as latents. A room that is not in
@@ -126,6 +123,14 @@ impl Costs<'_> {
 /// Products of coordinates when a view is compared with this many frames, to find the nearest.
 pub fn products(coordinates: usize, frame_count: usize) -> f64 {
     (coordinates + CHOICE) as f64 * frame_count as f64
+}
+
+/// Lane of a batch by the products of its requests; `None` for a request of another cost.
+fn batch_lane(products: impl Iterator<Item = Option<f64>>) -> Lane {
+    match products.sum::<Option<f64>>() {
+        Some(products) if products <= SHORT_BATCH => Lane::Short,
+        _ => Lane::Long,
+    }
 }
 
 /// Lane of work without images, of this many products of coordinates.
@@ -298,5 +303,12 @@ mod tests {
         // Four latents of 20 numbers among 5,000 frames, and among 30,000.
         assert_eq!(brief_or_short(4.0 * products(20, 5_000)), Lane::Brief);
         assert_eq!(brief_or_short(4.0 * products(20, 30_000)), Lane::Short);
+
+        // 64 such requests, 256 in a larger room, and one whose cost is not known.
+        let each = |frames| Some(4.0 * products(20, frames));
+        let of = |count, frames| std::iter::repeat_n(each(frames), count);
+        assert_eq!(batch_lane(of(64, 5_000)), Lane::Short);
+        assert_eq!(batch_lane(of(256, 30_000)), Lane::Long);
+        assert_eq!(batch_lane(of(64, 5_000).chain([None])), Lane::Long);
     }
 }

@@ -1,8 +1,8 @@
 //! What servers derive from the frames of a room and an adapter, kept in the folder `derived`.
 //!
-//! A file is named by the hash of the content that it was derived from: frames, features, weights, and the version
-//! of the computation. It holds the SHA-256 of its tensors, and the tensors. A missing or damaged file costs time
-//! only; garbage collection removes the files of revisions that are gone.
+//! A file is named by the hash of the content that it was derived from: frames, features, weights, and
+//! the version of the computation. It holds the SHA-256 of its tensors, and the tensors. A missing or
+//! damaged file costs time only; garbage collection removes the files of revisions that are gone.
 
 use std::collections::BTreeSet;
 
@@ -14,7 +14,6 @@ use sha2::{Digest, Sha256};
 use super::format::{AdapterBody, RoomBody};
 use super::tensors::{TensorReader, TensorWriter};
 use super::{Error, Kind, Store, StoredAdapter, folder_of, sha256};
-use seese3_core::features::FeatureSource;
 use seese3_robot::tracking::{FeatureTables, MapTables};
 
 /// The folder of the files.
@@ -45,14 +44,10 @@ pub struct DerivedKey(String);
 impl DerivedKey {
     /// The key of a room and an adapter; `None` if the room lacks the adapter's features.
     fn of(room: &RoomBody, adapter: &AdapterBody) -> Option<Self> {
-        let FeatureSource { name, parts, .. } = &adapter.source;
-        let names: Vec<&str> = match parts.as_slice() {
-            [] => vec![name],
-            parts => parts.iter().map(|part| part.name.as_str()).collect(),
-        };
-        let features = names.iter().map(|name| {
+        // The same choice as in `Features::of_source`.
+        let features = adapter.source.parts().iter().map(|part| {
             let mut entries = room.features.iter();
-            let entry = entries.find(|entry| entry.source.name == *name)?;
+            let entry = entries.find(|entry| entry.source.is_like(part))?;
             Some(entry.object.sha256.as_str())
         });
         let features: Option<Vec<&str>> = features.collect();
@@ -74,8 +69,8 @@ impl DerivedKey {
 }
 
 impl Store {
-    /// The key of what is derived from a revision of a room and an adapter; `None` if the room lacks the adapter's
-    /// features.
+    /// The key of what is derived from a revision of a room and an adapter; `None` if the room lacks the
+    /// adapter's features.
     ///
     /// # Errors
     /// As [`Store::load_room`], of the manifests alone.
@@ -115,28 +110,45 @@ impl Store {
         written.map(|_| ()).map_err(|error| self.io(&path, error))
     }
 
-    /// The names of the files that the present revisions can be derived to.
-    pub(super) async fn derived_names(&self) -> Result<BTreeSet<String>, Error> {
+    /// The paths of the files that may be derived from the present revisions.
+    pub(super) async fn derived_paths(&self) -> Result<BTreeSet<String>, Error> {
         let mut rooms = Vec::new();
-        for (name, numbers) in self.numbered(Kind::Room).await? {
-            let folder = folder_of(Kind::Room, &name);
-            for revision in numbers.present {
-                rooms.push(self.room_body(&folder, revision).await?);
-            }
+        for (folder, revision) in self.present(Kind::Room).await? {
+            rooms.extend(unless_removed(self.room_body(&folder, revision).await)?);
         }
 
-        let mut names = BTreeSet::new();
-        for (name, numbers) in self.numbered(Kind::Adapter).await? {
-            let folder = folder_of(Kind::Adapter, &name);
-            for revision in numbers.present {
-                let adapter = self.adapter_body(&folder, revision).await?;
-                let keys = rooms
-                    .iter()
-                    .filter_map(|room| DerivedKey::of(room, &adapter));
-                names.extend(keys.map(|key| key.path().to_string()));
-            }
+        let mut paths = BTreeSet::new();
+        for (folder, revision) in self.present(Kind::Adapter).await? {
+            let adapter = unless_removed(self.adapter_body(&folder, revision).await)?;
+            let Some(adapter) = adapter else {
+                continue;
+            };
+            let keys = rooms
+                .iter()
+                .filter_map(|room| DerivedKey::of(room, &adapter));
+            paths.extend(keys.map(|key| key.path().to_string()));
         }
-        Ok(names)
+        Ok(paths)
+    }
+
+    /// All revisions of this kind, each with the folder of its room or adapter.
+    async fn present(&self, kind: Kind) -> Result<Vec<(Path, u64)>, Error> {
+        let numbered = self.numbered(kind).await?;
+        let revisions = numbered.into_iter().flat_map(|(name, numbers)| {
+            let folder = folder_of(kind, &name);
+            let present = numbers.present.into_iter();
+            present.map(move |revision| (folder.clone(), revision))
+        });
+        Ok(revisions.collect())
+    }
+}
+
+/// A manifest, or `None` if it was removed after it was listed.
+fn unless_removed<T>(body: Result<T, Error>) -> Result<Option<T>, Error> {
+    match body {
+        Ok(body) => Ok(Some(body)),
+        Err(Error::Absent { .. }) => Ok(None),
+        Err(error) => Err(error),
     }
 }
 
@@ -174,14 +186,13 @@ fn write(derived: &Derived, file: &str) -> Result<Vec<u8>, Error> {
 fn read(file: &str, bytes: &[u8]) -> Result<Derived, Error> {
     let tensors = TensorReader::new(file, bytes)?;
     let row = |name: &str| Ok::<_, Error>(tensors.f64(name)?.into_iter().collect::<Vec<f64>>());
+
+    // A map that lacks numbers is not made of these tables.
     let by_feature = || {
-        let errors = tensors.f64(FEATURE_ERRORS)?;
-        let errors = [0, 1].map(|at| {
-            errors
-                .outer_iter()
-                .nth(at)
-                .map_or(Vec::new(), |row| row.to_vec())
-        });
+        let errors = row(FEATURE_ERRORS)?;
+        let (first, second) = errors.split_at(errors.len().min(MapTables::ERRORS));
+        let errors = [first.to_vec(), second.to_vec()];
+
         Ok::<_, Error>(FeatureTables {
             mean: Array1::from(row(MEAN)?),
             components: tensors.f64(COMPONENTS)?,
@@ -189,6 +200,7 @@ fn read(file: &str, bytes: &[u8]) -> Result<Derived, Error> {
             errors,
         })
     };
+
     let map = || {
         Ok::<_, Error>(MapTables {
             typical_distance: row(TYPICAL_DISTANCE)?.first().copied().unwrap_or(f64::NAN),
@@ -196,6 +208,7 @@ fn read(file: &str, bytes: &[u8]) -> Result<Derived, Error> {
             by_feature: tensors.has(MEAN).then(by_feature).transpose()?,
         })
     };
+
     Ok(Derived {
         latents: tensors.f64(LATENTS)?,
         map: tensors.has(TYPICAL_DISTANCE).then(map).transpose()?,

@@ -136,7 +136,7 @@ impl Store {
             return Ok(());
         }
 
-        match self.derived_names().await {
+        match self.derived_paths().await {
             Ok(needed) => {
                 let is_garbage = |file: &&ObjectMeta| {
                     file.last_modified <= before && !needed.contains(file.location.as_ref())

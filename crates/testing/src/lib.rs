@@ -33,6 +33,21 @@ pub(crate) fn noise(seed: u64, place: usize) -> f64 {
         - 1.0
 }
 
+/// Rooms in the form that training takes, all of revision 1.
+#[cfg(feature = "world")]
+pub(crate) fn room_data(
+    rooms: &[(seese3_core::room::Room, seese3_core::features::Features)],
+) -> Vec<seese3_core::training::RoomData<'_>> {
+    rooms
+        .iter()
+        .map(|(room, features)| seese3_core::training::RoomData {
+            room,
+            revision: 1,
+            features,
+        })
+        .collect()
+}
+
 /// The folder of large inputs outside the repository: `SEESE3_SHARED`, else `../shared`.
 ///
 /// # Panics

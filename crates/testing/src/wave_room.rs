@@ -7,10 +7,10 @@ use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::{Pose, Twist, exp};
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_core::splits::Split;
-use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
+use seese3_core::training::{TrainingPlan, train_adapter};
 use seese3_robot::calibration::calibrate;
 
-use crate::noise;
+use crate::{noise, room_data};
 
 /// Columns of the features.
 pub const COLUMNS: usize = 768;
@@ -57,14 +57,7 @@ pub fn wave_room(name: &str, seed: u64, frame_count: usize) -> (Room, Features) 
 
 /// An adapter for tracking, trained in the first of three or more rooms and calibrated in the others.
 pub fn calibrated(rooms: &[(Room, Features)]) -> (Adapter, TrainingRecord) {
-    let room_data: Vec<RoomData<'_>> = rooms
-        .iter()
-        .map(|(room, features)| RoomData {
-            room,
-            revision: 1,
-            features,
-        })
-        .collect();
+    let room_data = room_data(rooms);
 
     let plan = TrainingPlan::of(Preset::PaperBase, Split::Whole, 20, 0);
     let (adapter, record) = train_adapter(&room_data[..1], &plan, &mut |_| ()).unwrap();

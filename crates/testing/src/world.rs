@@ -7,10 +7,10 @@ use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::{CameraIntrinsics, Distortion, PixelCamera, Pose};
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_core::splits::Split;
-use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
+use seese3_core::training::{TrainingPlan, train_adapter};
 use seese3_robot::calibration::calibrate;
 
-use crate::noise;
+use crate::{noise, room_data};
 
 pub const FRAMES: usize = 300;
 const COLUMNS: usize = 48;
@@ -82,30 +82,12 @@ fn train_and_calibrate() -> (Adapter, TrainingRecord) {
     let mut plan = TrainingPlan::of(Preset::PaperBase, Split::Whole, 10, 0);
     plan.config.epochs = 60;
 
-    let room_data: Vec<RoomData<'_>> = learned
-        .iter()
-        .map(|(room, features)| RoomData {
-            room,
-            revision: 1,
-            features,
-        })
-        .collect();
-
-    let (adapter, record) = train_adapter(&room_data, &plan, &mut |_| ()).unwrap();
+    let (adapter, record) = train_adapter(&room_data(&learned), &plan, &mut |_| ()).unwrap();
     let others: Vec<(Room, Features)> = (10..14)
         .map(|seed| place(&format!("other{seed}"), seed))
         .collect();
 
-    let room_data: Vec<RoomData<'_>> = others
-        .iter()
-        .map(|(room, features)| RoomData {
-            room,
-            revision: 1,
-            features,
-        })
-        .collect();
-
-    let calibrated = calibrate(adapter, record, &room_data).unwrap();
+    let calibrated = calibrate(adapter, record, &room_data(&others)).unwrap();
     assert!(calibrated.can_track);
     (calibrated.adapter, calibrated.record)
 }

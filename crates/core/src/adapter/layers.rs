@@ -62,8 +62,9 @@ pub(super) fn linear<T: Real>(
 /// Terms of a dot product that are summed side by side.
 const LANES: usize = 32;
 
-/// The dot products of a vector with the rows of a matrix, by the widest instructions of this processor. The order of
-/// the sums is fixed. Loops over indexes: closures would be compiled without those instructions.
+/// The dot products of a vector with the rows of a matrix, by the widest instructions of this
+/// processor. The order of the sums is fixed. Loops over indexes: closures would be compiled without
+/// those instructions.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
 fn dot_products<T: Real>(matrix: &[T], vector: &[T]) -> Vec<T> {
     let mut products = Vec::with_capacity(matrix.len() / vector.len().max(1));
@@ -76,6 +77,7 @@ fn dot_products<T: Real>(matrix: &[T], vector: &[T]) -> Vec<T> {
                 sums[lane] += row[lane] * vector[lane];
             }
         }
+
         let mut sum = T::zero();
         for (&x, &y) in row_rest.iter().zip(vector_rest) {
             sum += x * y;
@@ -85,6 +87,7 @@ fn dot_products<T: Real>(matrix: &[T], vector: &[T]) -> Vec<T> {
         }
         products.push(sum);
     }
+
     products
 }
 
@@ -257,5 +260,42 @@ impl<T: Real> Dense<T> {
         }
 
         d
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: the definition, in integers, which f64 and f32 add exactly.
+    #[test]
+    fn dot_products_are_sums_of_products() {
+        for width in [1, 31, 32, 33, 100] {
+            let entry = |at: usize| (at * 7 % 11) as i32 - 5;
+            let expected: Vec<i32> = (0..3)
+                .map(|row| {
+                    (0..width)
+                        .map(|i| entry(row * width + i) * entry(2 * i))
+                        .sum()
+                })
+                .collect();
+
+            let of = |count: usize, step: usize| -> Vec<f64> {
+                (0..count).map(|at| f64::from(entry(at * step))).collect()
+            };
+            let (matrix, vector) = (of(3 * width, 1), of(width, 2));
+            let found = dot_products(&matrix, &vector);
+            assert_eq!(
+                found,
+                expected.iter().map(|&x| f64::from(x)).collect::<Vec<_>>()
+            );
+
+            let single = |values: &[f64]| values.iter().map(|&x| x as f32).collect::<Vec<_>>();
+            let found = dot_products(&single(&matrix), &single(&vector));
+            assert_eq!(
+                found,
+                expected.iter().map(|&x| x as f32).collect::<Vec<_>>()
+            );
+        }
     }
 }

@@ -111,7 +111,8 @@ impl Navigator {
         Self::of_latents(room, features, adapter, kind, latents)
     }
 
-    /// As [`Navigator::new`], with latents (n, k) that were computed before from the same features and adapter.
+    /// As [`Navigator::new`], with latents (n, k) that were computed before from the same features and
+    /// adapter.
     ///
     /// # Errors
     /// As [`Navigator::new`]; [`Error::FeatureRows`] also for another number of latents.
@@ -123,9 +124,10 @@ impl Navigator {
         latents: Array2<f64>,
     ) -> Result<Self, Error> {
         adapter.check_source(features.source())?;
-        for latent in latents.outer_iter().take(1) {
+        if let Some(latent) = latents.outer_iter().next() {
             adapter.check_latent(&latent.to_vec())?;
         }
+
         let frame_count = room.frame_count();
         for rows in [features.rows().nrows(), latents.nrows()] {
             if rows != frame_count {

@@ -307,8 +307,8 @@ fn blends_without(
         .second_opinion
         .map(|coordinates| distances_from(coordinates, mapped, frame));
 
-    let left =
-        |distances: &[Neighbor]| left_by_round(navigator.room().timeline(), distances, frame);
+    let timeline = navigator.room().timeline();
+    let left = |distances: &[Neighbor]| left_by_round(timeline, distances, frame);
     let nearest = left(&distances);
     let nearest_unseen = distances_unseen.as_deref().map(left);
     let nearest_by_second = second.as_deref().map(left);
@@ -338,14 +338,15 @@ fn blends_without(
     (0..=LEFT_OUT_ROWS.len()).filter_map(found).collect()
 }
 
-/// The [`LOOKED_AT`] nearest frames of each round of [`LEFT_OUT_ROWS`], and of the round without the sequence of
-/// `frame`; fewer if fewer are left.
+/// The [`LOOKED_AT`] nearest frames of each round of [`LEFT_OUT_ROWS`], and of the round without the
+/// sequence of `frame`; fewer if fewer are left.
 fn left_by_round(
     timeline: &Timeline,
     distances: &[Neighbor],
     frame: FrameId,
 ) -> Vec<Vec<Neighbor>> {
-    // Each of the first rounds leaves out frames of a window, so that its nearest are among as many frames more.
+    // A round leaves out at most this many frames, so that the nearest that it leaves are among as many
+    // frames more.
     let most_left_out = 2 * LEFT_OUT_ROWS.iter().copied().max().unwrap_or(0) as usize + 1;
     let mut near = distances.to_vec();
     let count = LOOKED_AT + most_left_out;
@@ -354,7 +355,6 @@ fn left_by_round(
         near.truncate(count);
     }
     near.sort_unstable_by(Neighbor::nearer);
-
     let rounds = LEFT_OUT_ROWS.iter().map(|&rows| {
         let is_left = |other: &&Neighbor| other.frame.0.abs_diff(frame.0) > rows;
         near.iter()
@@ -363,6 +363,8 @@ fn left_by_round(
             .copied()
             .collect()
     });
+
+    // A sequence may have any number of frames.
     let mut elsewhere = Nearest::new(LOOKED_AT);
     for other in distances {
         if !timeline.joins(other.frame, frame) {

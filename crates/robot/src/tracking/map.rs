@@ -58,6 +58,23 @@ struct AppearanceMap {
 }
 
 impl AppearanceMap {
+    /// The map of these tables; `None` if they do not fit the mapped frames, in order.
+    fn of_tables(tables: FeatureTables, mapped: &[FrameId]) -> Option<Self> {
+        if tables.coordinates.dim() != (mapped.len(), tables.components.nrows()) {
+            return None;
+        }
+
+        let [with_latent, without_latent] = &tables.errors;
+        Some(Self {
+            index: ExactIndex::of_frames(tables.coordinates.view(), mapped),
+            errors: ViewErrors {
+                with_latent: BlendErrors::of_numbers(with_latent)?,
+                without_latent: BlendErrors::of_numbers(without_latent)?,
+            },
+            appearance: Appearance::of_parts(tables.mean, tables.components)?,
+        })
+    }
+
     /// The mapped frames most similar to a feature of shape (d,).
     fn nearest(&self, feature: &[f32], count: usize) -> Vec<Neighbor> {
         let coordinates = self.appearance.coordinates(feature).to_vec();
@@ -77,15 +94,15 @@ pub struct Map {
     by_appearance: Option<AppearanceMap>,
 }
 
-/// What a map derives from the latents and features of its frames. It takes most of the time of making a
-/// map, and can be kept.
+/// What a map derives from the latents and features of its frames. It takes most of the time of
+/// making a map, and can be kept.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MapTables {
-    /// The typical distance between views when a camera returns to a place, in standard deviations of
-    /// frame noise.
+    /// The typical distance between views when a camera returns to a place, in standard deviations
+    /// of frame noise.
     pub typical_distance: f64,
-    /// Errors of poses by latent, as many numbers as [`MapTables::ERRORS`]; `None` if too few frames are
-    /// mapped.
+    /// Errors of poses by latent, as many numbers as [`MapTables::ERRORS`]; `None` if too few frames
+    /// are mapped.
     pub errors: Option<Vec<f64>>,
     /// Retrieval by feature, if there is any.
     pub by_feature: Option<FeatureTables>,
@@ -177,43 +194,32 @@ impl Map {
         })
     }
 
-    /// The map that gave these tables, of the same navigator and mapped frames. `None` if they do not fit.
-    ///
-    /// # Errors
-    /// [`Error::NotCalibrated`] if the adapter has no error model.
+    /// The map that gave these tables, of the same navigator and mapped frames, in order. `None` if they
+    /// do not fit, or the adapter has no error model.
     pub fn of_tables(
         navigator: Arc<Navigator>,
         mapped: &[FrameId],
         tables: MapTables,
-    ) -> Result<Option<Self>, Error> {
-        let (error_model, whitened) = whitened_latents(&navigator)?;
-        let errors_of = |numbers: &Vec<f64>| BlendErrors::of_numbers(numbers);
-        let by_appearance = |tables: FeatureTables| {
-            let [with_latent, without_latent] = &tables.errors;
-            let is_fit = tables.coordinates.dim() == (mapped.len(), tables.components.nrows());
-            Some(AppearanceMap {
-                index: ExactIndex::of_frames(tables.coordinates.view(), mapped),
-                errors: ViewErrors {
-                    with_latent: errors_of(with_latent)?,
-                    without_latent: errors_of(without_latent)?,
-                },
-                appearance: Appearance::of_parts(tables.mean, tables.components)?,
-            })
-            .filter(|_| is_fit)
+    ) -> Option<Self> {
+        let (error_model, whitened) = whitened_latents(&navigator).ok()?;
+        let errors = match tables.errors {
+            Some(numbers) => Some(BlendErrors::of_numbers(&numbers)?),
+            None => None,
+        };
+        let by_appearance = match tables.by_feature {
+            Some(tables) => Some(AppearanceMap::of_tables(tables, mapped)?),
+            None => None,
         };
 
-        let errors = tables.errors.as_ref().map(errors_of);
-        let by_appearance = tables.by_feature.map(by_appearance);
-        let is_whole = !matches!(errors, Some(None)) && !matches!(by_appearance, Some(None));
-        Ok(is_whole.then(|| Self {
+        Some(Self {
             index: ExactIndex::new(whitened.view(), mapped),
             typical_distance: tables.typical_distance,
-            errors: errors.flatten(),
-            by_appearance: by_appearance.flatten(),
+            errors,
+            by_appearance,
             navigator,
             error_model,
             pose_reader: None,
-        }))
+        })
     }
 
     /// What [`Map::of_tables`] makes this map of, without its localizer.
@@ -374,8 +380,8 @@ impl Map {
     }
 }
 
-/// The error model of a navigator's adapter, and the latents in standard deviations of frame noise, which
-/// are comparable between rooms and adapters.
+/// The error model of a navigator's adapter, and the latents in standard deviations of frame noise,
+/// which are comparable between rooms and adapters.
 fn whitened_latents(navigator: &Navigator) -> Result<(Arc<ErrorModel>, Array2<f64>), Error> {
     let adapter = navigator.adapter();
     let error_model = adapter.error_model().ok_or(Error::NotCalibrated)?.clone();

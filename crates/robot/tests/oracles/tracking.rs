@@ -583,7 +583,7 @@ fn a_map_of_tables_answers_as_the_first() {
     let tables = map.tables();
     assert!(alone.by_feature.is_none() && tables.by_feature.is_some());
 
-    let again = |tables| Map::of_tables(navigator.clone(), &mapped, tables).unwrap();
+    let again = |tables| Map::of_tables(navigator.clone(), &mapped, tables);
     let by_latent = again(alone).unwrap();
     let by_feature = again(tables.clone()).unwrap();
     for row in [0, 17, 150, 299] {

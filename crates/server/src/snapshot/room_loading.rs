@@ -5,7 +5,6 @@ use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
 
 use futures_util::FutureExt;
-use ndarray::Array2;
 
 use super::Refusal;
 use super::content::Content;
@@ -261,60 +260,37 @@ impl RoomLoader {
         })
     }
 
-    /// The navigator and the map of all frames, from what the store keeps or computed and then kept. There is no
-    /// map if the adapter is not calibrated, or, with a warning, if the room is too small for tracking.
+    /// The navigator and the map of all frames, of what the store keeps, else computed and then kept.
+    /// There is no map if the adapter is not calibrated, or, with a warning, if the room is too small for
+    /// tracking.
     async fn navigator_and_map(
         &self,
         loading: &LoadingRoom<'_>,
         adapter: &StoredAdapter,
         features: &Features,
     ) -> Result<(Arc<Navigator>, Option<Map>), Problem> {
-        let LoadingRoom { stored, frames, .. } = loading;
-        let revision = stored.revision;
+        let room = loading.frames;
+        let revision = loading.stored.revision;
+
+        // Without a key, everything is computed.
         let key = self
             .store
-            .derived_key(frames.id().as_str(), revision, adapter);
-        // Without a key, everything is computed.
+            .derived_key(room.id().as_str(), revision, adapter);
         let key = key.await.ok().flatten();
-        let kept = match &key {
-            Some(key) => self.store.load_derived(key).await,
-            None => None,
-        };
-
-        let new = |latents: Option<Array2<f64>>| {
-            let (room, adapter) = ((*frames).clone(), adapter.adapter.clone());
-            match latents {
-                Some(latents) => {
-                    Navigator::of_latents(room, features, adapter, self.index, latents)
-                }
-                None => Navigator::new(room, features, adapter, self.index),
-            }
-        };
-        let mapped: Vec<FrameId> = (0..frames.frame_count() as u32).map(FrameId).collect();
-        if let Some(Derived { latents, map }) = kept
-            && let Ok(navigator) = new(Some(latents))
+        if let Some(key) = &key
+            && let Some(derived) = self.store.load_derived(key).await
+            && let Some(made) = self.of_derived(room, adapter, features, derived)
         {
-            let navigator = Arc::new(navigator);
-            let map = match map {
-                // Why there is no map is found and logged again.
-                None if navigator.adapter().error_model().is_some() => None,
-                None => Some(None),
-                Some(tables) => Map::of_tables(navigator.clone(), &mapped, tables)
-                    .ok()
-                    .flatten()
-                    .map(Some),
-            };
-            if let Some(map) = map {
-                return Ok((navigator, map));
-            }
+            return Ok(made);
         }
 
-        let navigator = new(None).map_err(|problem| Problem::Navigator {
+        let navigator = Navigator::new(room.clone(), features, adapter.adapter.clone(), self.index);
+        let navigator = Arc::new(navigator.map_err(|problem| Problem::Navigator {
             adapter: adapter.name.clone(),
             problem,
-        })?;
-        let navigator = Arc::new(navigator);
-        let map = map(&navigator, features, &mapped);
+        })?);
+        let map = map(&navigator, features);
+
         if let Some(key) = &key {
             let derived = Derived {
                 latents: navigator.latents().to_owned(),
@@ -325,6 +301,33 @@ impl RoomLoader {
             }
         }
         Ok((navigator, map))
+    }
+
+    /// The navigator and the map of what was derived before; `None` if that does not fit, or if the reason
+    /// for having no map has to be found and logged again.
+    fn of_derived(
+        &self,
+        room: &Arc<Room>,
+        adapter: &StoredAdapter,
+        features: &Features,
+        derived: Derived,
+    ) -> Option<(Arc<Navigator>, Option<Map>)> {
+        let Derived { latents, map } = derived;
+        let adapter = adapter.adapter.clone();
+        let is_calibrated = adapter.error_model().is_some();
+        let navigator = Navigator::of_latents(room.clone(), features, adapter, self.index, latents);
+        let navigator = Arc::new(navigator.ok()?);
+
+        let map = match map {
+            Some(tables) => Some(Map::of_tables(
+                navigator.clone(),
+                &all_frames(room),
+                tables,
+            )?),
+            None if is_calibrated => return None,
+            None => None,
+        };
+        Some((navigator, map))
     }
 
     /// The reader of a fitted adapter, with its base as the second predictor.
@@ -351,7 +354,7 @@ impl RoomLoader {
             None => None,
         };
 
-        let mapped: Vec<FrameId> = (0..data.room.frame_count() as u32).map(FrameId).collect();
+        let mapped = all_frames(data.room);
         let localizer = Localizer::new(data, &mapped, base, Some(adapter.adapter.clone()))
             .map_err(|problem| Problem::Localizer {
                 adapter: adapter.name.clone(),
@@ -375,11 +378,16 @@ fn log_audit(navigator: &Navigator, adapter: &str) {
     }
 }
 
+fn all_frames(room: &Room) -> Vec<FrameId> {
+    (0..room.frame_count() as u32).map(FrameId).collect()
+}
+
 /// Computes the map of all frames of a room.
-fn map(navigator: &Arc<Navigator>, features: &Features, mapped: &[FrameId]) -> Option<Map> {
+fn map(navigator: &Arc<Navigator>, features: &Features) -> Option<Map> {
     navigator.adapter().error_model()?;
-    match Map::new(navigator.clone(), mapped) {
-        Ok(map) => Some(map.with_features(features.rows(), mapped)),
+    let mapped = all_frames(navigator.room());
+    match Map::new(navigator.clone(), &mapped) {
+        Ok(map) => Some(map.with_features(features.rows(), &mapped)),
         Err(error) => {
             tracing::warn!(room = %navigator.room().id(), %error, "tracking is unavailable");
             None

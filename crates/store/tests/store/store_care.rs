@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use object_store::local::LocalFileSystem;
+use seese3_core::adapter::Adapter;
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::room::{FrameId, Room, RoomId};
 use seese3_core::training::RoomData;
@@ -857,6 +858,39 @@ async fn what_is_derived_is_kept_while_its_room_is() {
         store.derived_key("hall", 2, &adapter).await.unwrap(),
         Some(key.clone())
     );
+
+    // The features that the adapter takes are those of its encoder, under any name.
+    let encoded = |name: &str, encoder: &str| {
+        let mut source = FeatureSource::imported(name, features.source().dim);
+        source.encoder = encoder.to_owned();
+        Features::new(source, features.rows().to_owned()).unwrap()
+    };
+    let room_of = |name: &str| {
+        let frames = hall.frames().clone();
+        Room::new(
+            RoomId::new(name).unwrap(),
+            frames,
+            hall.provenance().clone(),
+        )
+        .unwrap()
+    };
+    let sets = [encoded("made-up", "b"), encoded("other", "a")];
+    store
+        .publish_room(&room_of("renamed"), &sets)
+        .await
+        .unwrap();
+    let (seen, other) = (encoded("made-up", "a"), encoded("made-up", "c"));
+    let key_of = async |name: &str, set: &Features| {
+        let network = adapter.adapter.network().clone();
+        let scale = adapter.adapter.scale().clone();
+        let given = Adapter::new(set.source().clone(), network, scale).unwrap();
+        let published = store.publish_adapter(name, &given, &record, features.rows());
+        published.await.unwrap();
+        let stored = store.load_adapter(name, None).await.unwrap();
+        store.derived_key("renamed", 1, &stored).await.unwrap()
+    };
+    assert!(key_of("seen", &seen).await.is_some());
+    assert!(key_of("other", &other).await.is_none());
 
     store.collect_garbage(aged(Duration::ZERO)).await.unwrap();
     assert!(store.load_derived(&key).await.is_some());
