@@ -15,8 +15,9 @@ use seese3_core::room::Room;
 const SHORT: f64 = 1e6;
 /// Cost limit of work that is done in place, products of coordinates: about 0.1 ms.
 const BRIEF: f64 = 4e6;
-/// Cost limit of a BatchNavigate in the lane for short requests, products of coordinates: about 10 ms.
-const SHORT_BATCH: f64 = 100.0 * BRIEF;
+/// Cost limit of a BatchNavigate in the lane for short requests, products of coordinates: about 4 ms, and
+/// 8 ms more to embed and answer 256 requests (by the rates in docs/performance.md).
+const SHORT_BATCH: f64 = 25.0 * BRIEF;
 /// Products that take as long as choosing a frame among the nearest.
 const CHOICE: usize = 20;
 /// Maximum number of images of a request in the lane for images: a stereo pair.
