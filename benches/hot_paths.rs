@@ -26,6 +26,9 @@ use seese3_core::navigation::{
     RetrievalMetric, Source, SourceAt, StepKind,
 };
 use seese3_core::room::{FrameId, Room};
+use seese3_robot::matched_views::ViewKeypoints;
+use seese3_robot::two_view::estimate;
+use seese3_testing::keypoint_scene::{Random, Scene, camera_path, distorted_camera};
 use seese3_testing::panorama::{self, Panorama};
 use seese3_testing::wave_room::{COLUMNS, wave_room};
 
@@ -169,6 +172,29 @@ fn relational(criterion: &mut Criterion) {
     group.finish();
 }
 
+/// The motion between two views by their matched keypoints. A quarter of the points moves by itself. The peer is
+/// `benches/peers/two_view_sift.py`.
+fn two_views(criterion: &mut Criterion) {
+    let camera = distorted_camera();
+    let scene = Scene::in_box(3_000, 5);
+    let mut random = Random::new(6);
+    let mut later = scene.clone();
+    for point in later.points.iter_mut().step_by(4) {
+        *point += random.normals() * 0.3;
+    }
+    let [first, second] = [0, 8].map(|step| camera_path(100)[step]);
+    let first = scene.view(&first, &camera, 0.5, &mut random).keypoints;
+    let second = later.view(&second, &camera, 0.5, &mut random).keypoints;
+    let view = |keypoints| ViewKeypoints {
+        keypoints,
+        camera: &camera,
+    };
+
+    criterion.bench_function("two-views", |bencher| {
+        bencher.iter(|| estimate(view(&first), view(&second)));
+    });
+}
+
 /// Ten nearest of a path's latents: the exact scan beside hnsw_rs.
 fn scan(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("scan");
@@ -264,5 +290,5 @@ fn epoch(criterion: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, one_answer, relational, scan, epoch);
+criterion_group!(benches, one_answer, relational, two_views, scan, epoch);
 criterion_main!(benches);

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use anyhow::{Context, ensure};
 use clap::{Args, Subcommand};
 
-use super::evaluate::navigators_named;
+use super::evaluate::{check_reader, navigators_named};
 use super::named::one_of;
 use super::output::{
     JsonOutput, begin_input, begin_output, say, write_compact_json, write_file, write_json,
@@ -216,9 +216,9 @@ impl Answer {
         let benchmark = read_benchmark(&self.benchmark)?;
         check_submission_text(&self.name, &self.about)?;
         let store = Store::open(&self.store)?;
-        let navigators =
-            navigators_named(std::slice::from_ref(&self.navigator)).context("--navigator")?;
+        let navigators = navigators_named("--navigator", std::slice::from_ref(&self.navigator))?;
         let stored = store.load_adapter(&self.adapter, None).await?;
+        check_reader(&navigators, &stored)?;
         check_held_out(&benchmark, &self.adapter, &stored.record, &self.navigator)?;
         let adapter = stored.adapter;
         let protocol = Protocol {

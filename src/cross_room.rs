@@ -1,6 +1,6 @@
 //! `seese3 cross-room`: train on some rooms, navigate zero-shot in others.
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use clap::Args;
 use serde::Serialize;
 
@@ -220,6 +220,11 @@ impl CrossRoom {
 
     fn sizes(&self, rooms: usize) -> anyhow::Result<Vec<usize>> {
         let sizes = if self.sizes.is_empty() {
+            ensure!(
+                self.calibration_rooms < rooms,
+                "--calibration-rooms: {} of {rooms} rooms of --train leave none to train on",
+                self.calibration_rooms
+            );
             vec![rooms]
         } else {
             self.sizes.clone()
@@ -263,7 +268,7 @@ impl CrossRoom {
                 names.push(NavigatorKind::Relational.name());
             }
         }
-        let mut navigators = navigators_named(&names)?;
+        let mut navigators = navigators_named("--navigators", &names)?;
 
         // Reject navigators that no held-out room can evaluate; otherwise every room would be
         // skipped after the training.

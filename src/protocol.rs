@@ -22,7 +22,7 @@ pub enum Reader {
 /// Options of a reader that is trained beside the adapter.
 #[derive(Debug, Clone, Args)]
 pub struct ReaderOptions {
-    /// Also train a reader of this kind on the same features
+    /// Also train a reader of this kind on the same features, which must be of a grid
     #[arg(long, value_enum)]
     reader: Option<Reader>,
     /// Number of networks of the reader, whose densities are averaged, 1 to 16

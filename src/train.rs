@@ -263,7 +263,8 @@ fn correctors(names: &[String]) -> anyhow::Result<Vec<CorrectorKind>> {
     let kind = |name: &String| {
         let known = CorrectorKind::ALL.map(CorrectorKind::name).join(", ");
         name.parse()
-            .with_context(|| format!("--correctors: '{name}' is not one of {known}"))
+            .ok()
+            .with_context(|| format!("--correctors: '{name}' is not one of all, {known}"))
     };
 
     names.iter().map(kind).collect()

@@ -7,7 +7,8 @@
 Reads the pairs that `seese3 evaluate motion --stride 10` reads, or every N-th of them, and prints the same errors: medians and
 90 % quantiles in meters and degrees. SIFT (2,000 features, ratio test at 0.8) and MAGSAC with a threshold
 of one pixel in 640; a pair with fewer than 8 matches or inliers counts as no motion. An essential matrix
-has no scale: the true length of the translation is given to it. Needs numpy and opencv-python-headless.
+has no scale: the true length of the translation is given to it. Also prints the median times of one thread. Needs numpy and
+opencv-python-headless.
 
 With --drift it composes the motions of successive pairs of a sequence, and prints the mean drift of the path as
 `seese3 evaluate odometry` does: over parts of 0.5, 1, 2 and 4 m, per meter.
@@ -16,6 +17,7 @@ With --drift it composes the motions of successive pairs of a sequence, and prin
 import argparse
 import json
 import pathlib
+import time
 
 import cv2
 import numpy as np
@@ -92,8 +94,10 @@ def main():
         raise SystemExit("the room's camera has a distorted lens, which this program does not undistort")
     fx, fy = (given.focal, given.focal) if given.focal else stated["focal"]
 
+    cv2.setNumThreads(1)
     sift = cv2.SIFT_create(2000)
     found = {}
+    times = {"detecting in an image": [], "matching and fitting of a pair": []}
 
     def features(row):
         if row not in found:
@@ -101,7 +105,9 @@ def main():
             if given.width:
                 size = (given.width, round(image.shape[0] * given.width / image.shape[1]))
                 image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+            began = time.perf_counter()
             found[row] = (*sift.detectAndCompute(image, None), image.shape)
+            times["detecting in an image"].append(time.perf_counter() - began)
             found.pop(row - 200, None)
         return found[row]
 
@@ -120,7 +126,9 @@ def main():
         # OpenCV puts the center of the first pixel at (0, 0), the room at (0.5, 0.5).
         x, y = np.multiply(stated["center"], width) - 0.5 if stated else ((width - 1) / 2, (height - 1) / 2)
         camera = np.array([[fx * width, 0, x], [0, fy * width, y], [0, 0, 1.0]])
+        began = time.perf_counter()
         motion = read(first, second, camera, width, np.linalg.norm(truth[:3, 3]))
+        times["matching and fitting of a pair"].append(time.perf_counter() - began)
         failed += motion is None
         path.append(path[-1] @ (np.eye(4) if motion is None else motion))
         off = relative(np.eye(4) if motion is None else motion, truth)
@@ -128,6 +136,7 @@ def main():
         still.append((np.linalg.norm(truth[:3, 3]), angle(truth[:3, :3])))
 
     print(f"{len(errors)} pairs, {failed} without an answer")
+    print(", ".join(f"{what} {1000 * np.median(seconds):.1f} ms" for what, seconds in times.items()))
     if given.drift:
         truth = [poses[rows[0] + given.stride * step] for step in range(len(path))]
         percent, degrees = drift(truth, path)

@@ -47,8 +47,14 @@ impl Catalog {
                 .and_then(|test| test.overall)
                 .map_or("undefined".to_owned(), |r2| format!("{r2:.3}"));
 
+            let has_reader = adapter.navigators.iter().any(|name| name == "relational");
+            let reader = if has_reader {
+                ", relational reader"
+            } else {
+                ""
+            };
             say(format_args!(
-                "adapter {}: preset {}, split {}, stride {}, test R² {r2}",
+                "adapter {}: preset {}, split {}, stride {}, test R² {r2}{reader}",
                 revision_text(&adapter.name, adapter.revision),
                 adapter.preset,
                 value_text(adapter.split().as_str_name(), "SPLIT_"),

@@ -73,7 +73,8 @@ impl Motion {
             }
             _ => match self.images.as_deref() {
                 Some([a, b]) => Ok((image_view(a)?, image_view(b)?)),
-                _ => {
+                Some(files) => bail!("--images has {} files; give two, A,B", files.len()),
+                None => {
                     bail!(
                         "--from A --to B, --feature-file FILE --rows A,B or --images A,B is required"
                     )
@@ -136,7 +137,7 @@ impl Motion {
         if let Some(variances) = diagonal(&motion.covariance) {
             let deviation = |part: &[f64]| (part.iter().sum::<f64>() / 3.0).sqrt();
             say(format_args!(
-                "standard deviation {:.3} m, {:.1}° per axis",
+                "standard deviation {:.3} m, {:.1}° (mean of the axes)",
                 deviation(&variances[..3]),
                 deviation(&variances[3..]).to_degrees()
             ));

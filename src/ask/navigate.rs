@@ -8,7 +8,7 @@ use crate::named::one_of;
 use crate::output::{JsonOutput, say};
 use seese3_client::proto::v1 as pb;
 use seese3_core::adapter::Reading;
-use seese3_core::navigation::Mode;
+use seese3_core::navigation::{Mode, NavigatorKind};
 
 #[derive(Debug, Args)]
 pub struct Navigate {
@@ -48,7 +48,7 @@ pub struct Navigate {
     /// if neither this nor --navigator is given
     #[arg(long = "inverse", value_name = "VARIANT", value_parser = one_of::<Reading>(), conflicts_with = "navigator")]
     reading: Option<Reading>,
-    /// Navigator by name, instead of inverse Poincaré: corrector-mlp-3, ridge-refit,
+    /// Navigator by name, instead of inverse Poincaré: corrector-mlp-3, ridge-refit, relational,
     /// inverse-poincare-affine+motion, …; if empty, inverse Poincaré in the given --inverse
     #[arg(long, default_value = "", hide_default_value = true)]
     navigator: String,
@@ -144,6 +144,10 @@ pub fn say_navigation(answer: &pb::NavigateResponse) {
 
     if let Some(motion) = &answer.motion {
         say(format_args!("motion {}", motion_text(motion)));
+    }
+
+    if answer.navigator == NavigatorKind::Relational.name() {
+        say("distances are negative log-densities of the motion, nats up to a constant");
     }
 
     for step in &answer.steps {

@@ -74,8 +74,8 @@ impl KeypointViews {
     ) -> anyhow::Result<(&'a RoomKeypoints, Encoded)> {
         let Some(keypoints) = &stored.keypoints else {
             bail!(
-                "room '{}' has no keypoints: encode it with `seese3 encode --recipe xfeat-keypoints`, or give \
-                 --adapter",
+                "room '{}' has no keypoints: encode it with `seese3 encode --recipe xfeat-keypoints`, or leave \
+                 out --keypoints and give --adapter",
                 stored.room.id()
             );
         };

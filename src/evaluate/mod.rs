@@ -19,7 +19,7 @@ use std::ffi::OsStr;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use clap::{Args, Subcommand};
 
 use super::named::one_of;
@@ -138,7 +138,8 @@ struct Navigation {
     /// ε of Hit@ε, separated by commas
     #[arg(long, value_delimiter = ',', default_values_t = seese3_core::navigation::HIT_THRESHOLDS)]
     thresholds: Vec<f64>,
-    /// Navigators, the rows of the table, by name, separated by commas; +row-space, +whitened or
+    /// Navigators, the rows of the table, by name, separated by commas: identity, random, oracle,
+    /// relational, inverse-poincare-affine, ridge-refit, …; +row-space, +whitened or
     /// +motion may follow the name of a step, and +calibrated may follow
     /// inverse-poincare-homogeneous
     #[arg(long, value_delimiter = ',')]
@@ -202,8 +203,16 @@ impl Navigation {
 
         let record = chosen.record.clone();
         let protocol = self.protocol(&record)?;
+        check_reader(&protocol.navigators, &chosen)?;
         let room = Arc::new(stored.room);
-        let navigator = Navigator::new(room, &features, chosen.adapter.clone(), IndexKind::Exact)?;
+        let navigator = Navigator::new(room, &features, chosen.adapter.clone(), IndexKind::Exact)
+            .with_context(|| {
+            format!(
+                "features '{features_name}', adapter '{}' of features '{}'",
+                chosen.name,
+                chosen.adapter.source().name
+            )
+        })?;
 
         // Counted before the work starts, since the progress bar needs a total.
         let rows = protocol.rows(&navigator)?.len();
@@ -340,7 +349,7 @@ impl Navigation {
             steps: self.steps,
             mode: self.mode,
             shortlist: self.shortlist,
-            navigators: navigators_named(&self.navigators)?,
+            navigators: navigators_named("--navigators", &self.navigators)?,
         })
     }
 }
@@ -401,12 +410,12 @@ fn say_caveats(protocol: &Protocol, record: &TrainingRecord, room: &RoomId, leak
     ));
 }
 
-/// The navigators with these names; the error lists the known names.
-pub fn navigators_named(names: &[String]) -> anyhow::Result<Vec<NavigatorKind>> {
+/// The navigators with these names, which `option` gave; the error lists the known names.
+pub fn navigators_named(option: &str, names: &[String]) -> anyhow::Result<Vec<NavigatorKind>> {
     let named = |name: &String| {
         let unknown = || {
             format!(
-                "--navigators: '{name}' is not one of {}",
+                "{option}: '{name}' is not one of {}",
                 NavigatorKind::known_names()
             )
         };
@@ -414,6 +423,18 @@ pub fn navigators_named(names: &[String]) -> anyhow::Result<Vec<NavigatorKind>> 
     };
 
     names.iter().map(named).collect()
+}
+
+/// Refuses the relational navigator for an adapter without a reader.
+pub fn check_reader(navigators: &[NavigatorKind], stored: &StoredAdapter) -> anyhow::Result<()> {
+    let asks = navigators.contains(&NavigatorKind::Relational);
+    ensure!(
+        !asks || stored.adapter.relational().is_some(),
+        "adapter '{}' has no relational reader: name one that has with --adapter (`seese3 store show` lists it), or \
+         train one with --reader relational",
+        stored.name
+    );
+    Ok(())
 }
 
 /// The named adapter, else the default adapter of an evaluation of this room: the one that a server

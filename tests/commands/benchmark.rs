@@ -72,6 +72,18 @@ fn submissions_are_scored_as_evaluate_scores() {
         &format!("{check} --submission small.json"),
         &["small.json", "submission"],
     );
+    let mut submission = here.json("paper.json");
+    submission["frames"]["r"][5] = (-1).into();
+    std::fs::write(here.file("wrong.json"), submission.to_string()).unwrap();
+    here.refuses(
+        &format!("{check} --submission wrong.json"),
+        &[
+            "wrong.json",
+            "frames.r[5]",
+            "-1",
+            "a whole number from 0 on",
+        ],
+    );
     here.refuses(
         "benchmark score --benchmark small.json --store store --submission paper.json --submission paper.json",
         &["'paper' is in two submissions"],

@@ -31,6 +31,20 @@ fn a_relational_reader_is_trained_evaluated_and_served() {
     let rate = number(&row["hit"]["0.1"]["rate"]);
     assert!((0.0..=1.0).contains(&rate), "{row}");
 
+    // Alone, its row still has a difference from Identity.
+    here.succeeds(&format!(
+        "{evaluate} --navigators relational --json alone.json"
+    ));
+    let alone = here.json("alone.json");
+    assert_eq!(
+        alone["navigators"][0]["hit_over_identity"],
+        row["hit_over_identity"]
+    );
+    here.prints(
+        "store show --store store adapters/eyes",
+        &["with a relational reader"],
+    );
+
     // A shortlist of one is what inverse Poincaré retrieves.
     here.succeeds(&format!("{evaluate} --shortlist 1 --json one.json"));
     let found = here.json("one.json");
@@ -40,7 +54,14 @@ fn a_relational_reader_is_trained_evaluated_and_served() {
 
     let motion =
         "evaluate motion --store store --room studio3-0002 --adapter eyes --json motion.json";
-    here.prints(motion, &["its relational reader", "no motion"]);
+    here.prints(
+        motion,
+        &[
+            "its relational reader",
+            "no motion",
+            "the relational reader gave all motions; ",
+        ],
+    );
     let found = here.json("motion.json");
     assert_eq!(
         found["relational"]["components"].as_array().unwrap().len(),
@@ -57,7 +78,11 @@ fn a_relational_reader_is_trained_evaluated_and_served() {
         &["relational reader of adapter", "standard deviation"],
     );
     let navigate = format!("navigate {to} --from 1 --to 11 --navigator relational");
-    here.prints(&navigate, &["relational"]);
+    here.prints(&navigate, &["relational", "negative log-densities"]);
+    here.prints(
+        &format!("catalog --server {}", server.address),
+        &[", relational reader"],
+    );
 }
 
 /// Oracle: the contract: features that are no grid, and names that are not there.
@@ -71,6 +96,15 @@ fn features_without_cells_train_no_reader() {
         &["'fourier'", "grid"],
     );
     here.refuses(&format!("{train} --features fourier,other"), &["'other'"]);
+    here.refuses(
+        &format!("{train} --features fourier,fourier"),
+        &["'fourier' are given twice"],
+    );
+    here.succeeds(&format!("{train} --name plain"));
+    here.refuses(
+        "evaluate --store store --room r --adapter plain --navigators relational",
+        &["adapter 'plain' has no relational reader"],
+    );
 
     let cross = "cross-room --store store --train r --test r2 --navigators relational";
     here.succeeds(&Place::import("r2", "synthetic_b"));

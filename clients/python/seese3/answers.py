@@ -644,7 +644,7 @@ class Localization:
     z, and rotations about the axes of the world frame; None if the errors of the method were not measured. `novelty`
     above 1 means not in the map. `method` is "matched_keypoints", "fitted_adapter", "similar_frames", "nearest_frame"
     or "recorded"; None without a pose. `frames` are the stored frames most similar to the view, the best first;
-    `exact` is False if an approximate index found them.
+    `exact` is False if an approximate index found them, and `index` is its name: "exact" or "hnsw".
     """
 
     pose: Array | None
@@ -659,6 +659,7 @@ class Localization:
     adapter: Revision | None
     room_count: int
     exact: bool
+    index: str | None
 
     @classmethod
     @understood
@@ -679,6 +680,7 @@ class Localization:
             Revision.of(message.adapter) if message.HasField("adapter") else None,
             message.room_count,
             message.exact,
+            message.index or None,
         )
 
 
@@ -787,6 +789,7 @@ class Navigation:
     inverse_variant: str | None
     navigator: str
     exact: bool
+    index: str
     _message: navigation_pb2.NavigateResponse = field(repr=False)
 
     # Of a batch, most callers look at the last frame of each answer: what they do not look at is not made.
@@ -814,6 +817,7 @@ class Navigation:
             _word_or_none(navigation_pb2.InverseVariant, message.inverse_variant, "INVERSE_VARIANT_"),
             message.navigator,
             message.exact,
+            message.index,
             message,
         )
 

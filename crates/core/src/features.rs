@@ -37,6 +37,8 @@ pub enum Error {
     },
     #[error("joined features cannot be joined again")]
     JoinedTwice,
+    #[error("features '{name}' are given twice; each part of joined features must be another")]
+    SamePart { name: String },
 }
 
 /// Maximum number of columns of a feature.
@@ -105,13 +107,18 @@ impl FeatureSource {
     /// field joins those of the parts with [`JOINED`].
     ///
     /// # Errors
-    /// [`Error::JoinedTwice`] if a part is joined itself.
+    /// [`Error::JoinedTwice`] if a part is joined itself, [`Error::SamePart`] if two parts are the same.
     pub fn joined(parts: &[Self]) -> Result<Self, Error> {
         if parts.iter().any(|part| !part.parts.is_empty()) {
             return Err(Error::JoinedTwice);
         }
         if let [only] = parts {
             return Ok(only.clone());
+        }
+        let is_first = |place: usize| !parts[..place].contains(&parts[place]);
+        if let Some(again) = (0..parts.len()).find(|&place| !is_first(place)) {
+            let name = parts[again].name.clone();
+            return Err(Error::SamePart { name });
         }
 
         let text = |field: fn(&Self) -> &String| {

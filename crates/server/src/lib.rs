@@ -414,6 +414,7 @@ pub async fn run(
         "serving"
     );
 
+    metrics.index(config.index);
     metrics.serving(first.counts());
 
     // Requests are answered from here on, until the shutdown signal or a failure of the server.

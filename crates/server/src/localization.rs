@@ -152,6 +152,7 @@ fn answer(
         Some(retrieved) => pb::LocalizeResponse {
             adapter: Some(convert::adapter_revision(&retrieved.served[0])),
             frames: retrieved.frames_to_wire()?,
+            index: retrieved.served[0].navigator.index_kind().name().to_owned(),
             ..Default::default()
         },
         None => pb::LocalizeResponse::default(),

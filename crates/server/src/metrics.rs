@@ -3,7 +3,7 @@
 //! Every name begins with `seese3_`. Label values come from closed sets, never from requests, so
 //! that callers cannot create new time series.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use prometheus_client::collector::Collector;
@@ -19,6 +19,7 @@ use strum::{IntoStaticStr, VariantArray};
 use super::rpcs::known_path;
 use super::status::Full;
 use seese3_client::proto::v1::TrackStatus;
+use seese3_core::navigation::IndexKind;
 
 /// The metrics of one server. Clones share the same counters.
 #[derive(Debug, Clone)]
@@ -206,8 +207,7 @@ pub(super) struct ServedCounts {
 impl Metrics {
     /// The metrics in the text format, for a scrape.
     pub fn text(&self) -> String {
-        let registry = self.0.registry.lock();
-        let registry = registry.unwrap_or_else(PoisonError::into_inner);
+        let registry = self.registry();
 
         let mut text = String::new();
         // Writing into a string cannot fail.
@@ -246,9 +246,12 @@ impl Metrics {
     }
 
     fn register(&self, collector: Elsewhere) {
+        self.registry().register_collector(Box::new(collector));
+    }
+
+    fn registry(&self) -> MutexGuard<'_, Registry> {
         let registry = self.0.registry.lock();
-        let mut registry = registry.unwrap_or_else(PoisonError::into_inner);
-        registry.register_collector(Box::new(collector));
+        registry.unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Counts the start of a request or stream.
@@ -305,6 +308,13 @@ impl Metrics {
             let gauge = self.0.refused.get_or_create(&KindLabels { kind });
             gauge.set(count(refused));
         }
+    }
+
+    /// Names the index of the rooms' frames.
+    pub(super) fn index(&self, kind: IndexKind) {
+        let name = Info::new(vec![("kind", kind.name())]);
+        let help = "The index of the frames of a room";
+        self.registry().register("index", help, name);
     }
 
     /// Counts a check of the store for changes.

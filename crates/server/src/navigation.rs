@@ -134,5 +134,6 @@ fn navigate(
         navigator: convert::navigator_to_wire(&query),
         motion: answer.motion.map(|twist| convert::twist_to_wire(&twist)),
         exact: served.navigator.audit().is_none(),
+        index: served.navigator.index_kind().name().to_owned(),
     })
 }

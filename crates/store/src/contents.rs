@@ -216,6 +216,10 @@ fn adapter_summary(body: &AdapterBody) -> ManifestSummary {
         ),
         None => format!("for {features}"),
     };
+    let about = match &body.training.relational {
+        Some(_) => format!("{about}, with a relational reader"),
+        None => about,
+    };
 
     ManifestSummary {
         created: body.created.clone(),

@@ -140,7 +140,7 @@ pub struct TrainingEntry {
     train_mean_r2: Option<f64>,
     /// Settings of the relational reader; absent without one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    relational: Option<RelationalConfig>,
+    pub relational: Option<RelationalConfig>,
 }
 
 impl From<&RoomFit> for FittedEntry {

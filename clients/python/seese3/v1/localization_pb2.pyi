@@ -61,7 +61,7 @@ class LocalizeRequest(_message.Message):
     def __init__(self, rooms: _Optional[_Iterable[str]] = ..., room_revisions: _Optional[_Mapping[str, int]] = ..., adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ..., view: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ..., top_k: _Optional[int] = ..., camera: _Optional[_Union[_geometry_pb2.ViewCamera, _Mapping]] = ...) -> None: ...
 
 class LocalizeResponse(_message.Message):
-    __slots__ = ("pose", "room", "novelty", "method", "reason", "matches", "fitted", "frames", "adapter", "room_count", "exact")
+    __slots__ = ("pose", "room", "novelty", "method", "reason", "matches", "fitted", "frames", "adapter", "room_count", "exact", "index")
     POSE_FIELD_NUMBER: _ClassVar[int]
     ROOM_FIELD_NUMBER: _ClassVar[int]
     NOVELTY_FIELD_NUMBER: _ClassVar[int]
@@ -73,6 +73,7 @@ class LocalizeResponse(_message.Message):
     ADAPTER_FIELD_NUMBER: _ClassVar[int]
     ROOM_COUNT_FIELD_NUMBER: _ClassVar[int]
     EXACT_FIELD_NUMBER: _ClassVar[int]
+    INDEX_FIELD_NUMBER: _ClassVar[int]
     pose: _geometry_pb2.PoseWithCovariance
     room: _geometry_pb2.Revision
     novelty: float
@@ -84,7 +85,8 @@ class LocalizeResponse(_message.Message):
     adapter: _geometry_pb2.Revision
     room_count: int
     exact: bool
-    def __init__(self, pose: _Optional[_Union[_geometry_pb2.PoseWithCovariance, _Mapping]] = ..., room: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., novelty: _Optional[float] = ..., method: _Optional[_Union[LocalizationMethod, str]] = ..., reason: _Optional[str] = ..., matches: _Optional[_Union[KeypointMatches, _Mapping]] = ..., fitted: _Optional[_Union[FittedEstimate, _Mapping]] = ..., frames: _Optional[_Iterable[_Union[SimilarFrame, _Mapping]]] = ..., adapter: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., room_count: _Optional[int] = ..., exact: _Optional[bool] = ...) -> None: ...
+    index: str
+    def __init__(self, pose: _Optional[_Union[_geometry_pb2.PoseWithCovariance, _Mapping]] = ..., room: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., novelty: _Optional[float] = ..., method: _Optional[_Union[LocalizationMethod, str]] = ..., reason: _Optional[str] = ..., matches: _Optional[_Union[KeypointMatches, _Mapping]] = ..., fitted: _Optional[_Union[FittedEstimate, _Mapping]] = ..., frames: _Optional[_Iterable[_Union[SimilarFrame, _Mapping]]] = ..., adapter: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., room_count: _Optional[int] = ..., exact: _Optional[bool] = ..., index: _Optional[str] = ...) -> None: ...
 
 class BatchLocalizeRequest(_message.Message):
     __slots__ = ("requests",)

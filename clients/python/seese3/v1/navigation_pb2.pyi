@@ -104,7 +104,7 @@ class NavigateRequest(_message.Message):
     def __init__(self, room: _Optional[str] = ..., room_revision: _Optional[int] = ..., adapter: _Optional[str] = ..., adapter_revision: _Optional[int] = ..., source: _Optional[_Union[_geometry_pb2.View, _Mapping]] = ..., source_pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., motion: _Optional[_Union[RequestedMotion, _Mapping]] = ..., steps: _Optional[int] = ..., step_mode: _Optional[_Union[StepMode, str]] = ..., inverse_variant: _Optional[_Union[InverseVariant, str]] = ..., top_k: _Optional[int] = ..., exclude_source: _Optional[bool] = ..., exclude_radius: _Optional[int] = ..., navigator: _Optional[str] = ...) -> None: ...
 
 class NavigateResponse(_message.Message):
-    __slots__ = ("room", "adapter", "steps", "step_mode", "inverse_variant", "motion", "exact", "navigator")
+    __slots__ = ("room", "adapter", "steps", "step_mode", "inverse_variant", "motion", "exact", "navigator", "index")
     ROOM_FIELD_NUMBER: _ClassVar[int]
     ADAPTER_FIELD_NUMBER: _ClassVar[int]
     STEPS_FIELD_NUMBER: _ClassVar[int]
@@ -113,6 +113,7 @@ class NavigateResponse(_message.Message):
     MOTION_FIELD_NUMBER: _ClassVar[int]
     EXACT_FIELD_NUMBER: _ClassVar[int]
     NAVIGATOR_FIELD_NUMBER: _ClassVar[int]
+    INDEX_FIELD_NUMBER: _ClassVar[int]
     room: _geometry_pb2.Revision
     adapter: _geometry_pb2.Revision
     steps: _containers.RepeatedCompositeFieldContainer[NavigationStep]
@@ -121,7 +122,8 @@ class NavigateResponse(_message.Message):
     motion: _geometry_pb2.Twist
     exact: bool
     navigator: str
-    def __init__(self, room: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., adapter: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., steps: _Optional[_Iterable[_Union[NavigationStep, _Mapping]]] = ..., step_mode: _Optional[_Union[StepMode, str]] = ..., inverse_variant: _Optional[_Union[InverseVariant, str]] = ..., motion: _Optional[_Union[_geometry_pb2.Twist, _Mapping]] = ..., exact: _Optional[bool] = ..., navigator: _Optional[str] = ...) -> None: ...
+    index: str
+    def __init__(self, room: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., adapter: _Optional[_Union[_geometry_pb2.Revision, _Mapping]] = ..., steps: _Optional[_Iterable[_Union[NavigationStep, _Mapping]]] = ..., step_mode: _Optional[_Union[StepMode, str]] = ..., inverse_variant: _Optional[_Union[InverseVariant, str]] = ..., motion: _Optional[_Union[_geometry_pb2.Twist, _Mapping]] = ..., exact: _Optional[bool] = ..., navigator: _Optional[str] = ..., index: _Optional[str] = ...) -> None: ...
 
 class NavigationStep(_message.Message):
     __slots__ = ("step", "frames", "requested_pose", "error", "latent")

@@ -187,11 +187,12 @@ pub fn evaluate(
     }
 
     let identity = NavigatorKind::Identity.name();
-    if let Some(baseline) = rows.iter().find(|row| row.name == identity) {
-        let baseline = baseline.retrieval.clone();
-        for row in rows.iter_mut().filter(|row| row.name != identity) {
-            row.hits_over_identity = row.retrieval.hits_over(&baseline);
-        }
+    let baseline = match rows.iter().find(|row| row.name == identity) {
+        Some(row) => row.retrieval.clone(),
+        None => inputs.row(NavigatorKind::Identity)?.retrieval,
+    };
+    for row in rows.iter_mut().filter(|row| row.name != identity) {
+        row.hits_over_identity = row.retrieval.hits_over(&baseline);
     }
 
     // An empty list of navigators is replaced by the rows that were evaluated.

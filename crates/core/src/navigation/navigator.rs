@@ -205,6 +205,11 @@ impl Navigator {
         self.cells.as_ref()
     }
 
+    /// The kind of the index of the frames.
+    pub fn index_kind(&self) -> IndexKind {
+        self.search.kind()
+    }
+
     /// Recall of an approximate index against the exact scan; `None` if the index is exact.
     pub fn audit(&self) -> Option<Audit> {
         self.search.audit()

@@ -51,6 +51,15 @@ pub enum IndexKind {
 }
 
 impl IndexKind {
+    /// The name of the kind: `exact` or `hnsw`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Exact => "exact",
+            #[cfg(feature = "hnsw")]
+            Self::Hnsw(_) => "hnsw",
+        }
+    }
+
     /// Approximate number of frames that one query compares in a room of `frame_count` frames.
     pub fn comparisons(self, frame_count: usize) -> usize {
         match self {
@@ -188,6 +197,7 @@ fn whitening(rows: ArrayView2<'_, f64>) -> Array2<f64> {
 /// Candidate frames, indexed under a metric.
 pub struct Search {
     projection: Projection,
+    kind: IndexKind,
     index: Box<dyn Index>,
     audit: Option<Audit>,
 }
@@ -211,6 +221,7 @@ impl Search {
 
         Ok(Self {
             projection,
+            kind: IndexKind::Exact,
             index,
             audit: None,
         })
@@ -239,6 +250,7 @@ impl Search {
 
                 Ok(Self {
                     projection,
+                    kind,
                     index: Box::new(index),
                     audit,
                 })
@@ -275,6 +287,11 @@ impl Search {
     /// Approximate memory use, bytes.
     pub fn memory_bytes(&self) -> usize {
         self.index.memory_bytes()
+    }
+
+    /// The kind of the index.
+    pub fn kind(&self) -> IndexKind {
+        self.kind
     }
 
     /// Recall of an approximate index against the exact scan; `None` if the index is exact.

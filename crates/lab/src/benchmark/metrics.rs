@@ -13,7 +13,8 @@ use seese3_core::statistics::{RoomMean, bootstrap_mean, paired_difference};
 use seese3_core::training::{RoomData, TrainingPlan};
 
 use super::{
-    Benchmark, Error, check_benchmark, check_description, check_format, without_duplicates,
+    Benchmark, Error, check_benchmark, check_description, check_format, from_json,
+    without_duplicates,
 };
 use crate::experiments;
 use crate::experiments::cross_room::clipped_r2;
@@ -173,8 +174,7 @@ impl FeatureMetrics {
     /// # Errors
     /// [`Error`] names the first field that is wrong.
     pub fn read(bytes: &[u8], benchmark: &Benchmark) -> Result<Self, Error> {
-        let metrics: Self = serde_json::from_slice(bytes)
-            .map_err(|problem| Error::new("metrics", problem.to_string()))?;
+        let metrics: Self = from_json(bytes, "metrics")?;
         metrics.check(benchmark)?;
         Ok(metrics)
     }

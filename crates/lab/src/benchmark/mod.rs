@@ -12,7 +12,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::marker::PhantomData;
 
-use serde::de::{Error as _, IgnoredAny, MapAccess, Visitor};
+use serde::de::{DeserializeOwned, Error as _, IgnoredAny, MapAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
 use sha2::{Digest, Sha256};
 
@@ -50,6 +50,36 @@ impl Error {
             problem: problem.into(),
         }
     }
+}
+
+/// Reads a JSON file. `whole` names it in errors that are of no single field.
+///
+/// # Errors
+/// [`Error`] names the field that is wrong.
+fn from_json<T: DeserializeOwned>(bytes: &[u8], whole: &str) -> Result<T, Error> {
+    let mut json = serde_json::Deserializer::from_slice(bytes);
+    let parsed = serde_path_to_error::deserialize(&mut json).map_err(|error| {
+        let place = error.path().to_string();
+        let problem = error.into_inner();
+        let text = problem.to_string();
+        // The path says more than the line of a file that a program wrote, if the file is JSON at all.
+        let text = match text.split_once(" at line ") {
+            Some((what, _)) if problem.is_data() => what.to_owned(),
+            _ => text,
+        };
+        let place = if place == "." {
+            whole.to_owned()
+        } else {
+            place
+        };
+        Error::new(
+            place,
+            text.replace("expected u32", "expected a whole number from 0 on"),
+        )
+    })?;
+    let end = json.end();
+    end.map_err(|problem| Error::new(whole, problem.to_string()))?;
+    Ok(parsed)
 }
 
 /// A frozen list of rooms and pairs.
@@ -222,8 +252,7 @@ impl Benchmark {
     /// # Errors
     /// [`Error`] if it is no benchmark, or was changed after it was frozen.
     pub fn read(bytes: &[u8]) -> Result<Self, Error> {
-        let file: BenchmarkFile = serde_json::from_slice(bytes)
-            .map_err(|problem| Error::new("benchmark", problem.to_string()))?;
+        let file: BenchmarkFile = from_json(bytes, "benchmark")?;
         let BenchmarkFile {
             sha256, benchmark, ..
         } = file;
@@ -354,8 +383,7 @@ impl Submission {
     /// # Errors
     /// [`Error`] names the first field that is wrong.
     pub fn read(bytes: &[u8], benchmark: &Benchmark) -> Result<Self, Error> {
-        let submission: Self = serde_json::from_slice(bytes)
-            .map_err(|problem| Error::new("submission", problem.to_string()))?;
+        let submission: Self = from_json(bytes, "submission")?;
         submission.check(benchmark)?;
         Ok(submission)
     }

@@ -168,7 +168,7 @@ pub fn baselines_text(found: &MotionBaselines) -> String {
     };
 
     format!(
-        "R² of motions {:.3}; of the mean training motion {constant_r2:.3}\n\
+        "R² of the motions that W and φ predict {:.3}; of the mean training motion {constant_r2:.3}\n\
          (variance ratio of test to training motions {variance_ratio:.2}{nearest}; \
          {optimizer_steps} optimizer steps){verdict}",
         found.motion.overall

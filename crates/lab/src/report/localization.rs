@@ -3,7 +3,7 @@
 
 use serde::Serialize;
 
-use seese3_core::statistics::RecordedMedian;
+use seese3_core::statistics::{Coverage, RecordedMedian};
 
 use super::table::Table;
 use crate::experiments::localization::{Localization, LocalizationErrors};
@@ -184,24 +184,38 @@ pub fn motion_table(found: &MotionEvaluation) -> (Table, String) {
         ],
     );
 
-    let Some(TwoViewErrors {
+    let mut notes = Vec::new();
+    let ellipsoids = |coverage: &Coverage| {
+        format!(
+            "{:.2} and {:.2} of these lie within its 68 and 95 % ellipsoids",
+            coverage.within_68, coverage.within_95
+        )
+    };
+    match found.relational.as_ref().map(|found| &found.coverage) {
+        Some(Some(coverage)) => notes.push(format!(
+            "the relational reader gave all motions; {}",
+            ellipsoids(coverage)
+        )),
+        Some(None) => notes.push(
+            "the relational reader gives no covariance: it was not calibrated (train --calibrate-on)"
+                .to_owned(),
+        ),
+        None => {}
+    }
+    if let Some(TwoViewErrors {
         answered, coverage, ..
     }) = two_view
-    else {
-        return (table, String::new());
-    };
-
-    let mut notes = format!(
-        "matched keypoints gave {:.1} % of the motions",
-        100.0 * answered
-    );
-    if *answered > 0.0 {
-        notes += &format!(
-            "; {:.2} and {:.2} of these lie within its 68 and 95 % ellipsoids",
-            coverage.within_68, coverage.within_95
+    {
+        let answers = format!(
+            "matched keypoints gave {:.1} % of the motions",
+            100.0 * answered
         );
+        notes.push(match *answered > 0.0 {
+            true => format!("{answers}; {}", ellipsoids(coverage)),
+            false => answers,
+        });
     }
-    (table, notes)
+    (table, notes.join("\n"))
 }
 
 fn errors_table(first: &str, rows: &[(&str, Option<LocalizationErrors>)]) -> Table {

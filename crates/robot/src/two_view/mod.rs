@@ -11,11 +11,13 @@
 //! If the images constrain the translation poorly, it is shrunk towards zero and the covariance
 //! grows. `docs/two-views.md` describes how the parameters were chosen.
 
+mod seen;
 mod solver;
 
 use nalgebra::{Matrix6, Vector2, Vector3};
 
 use crate::matched_views::{ViewKeypoints, matched_keypoints, pixel_focal, plane_points};
+use seen::Matches;
 use seese3_core::geometry::{Pose, Twist, log, twist_covariance};
 pub(crate) use solver::usual_log_inverse_depth;
 
@@ -106,7 +108,8 @@ fn by_matches(matches: &[Match]) -> MotionEstimate {
         return MotionEstimate::none(matches.len(), 0.0);
     }
 
-    let found = solver::solve(matches);
+    let blocks = Matches::new(matches);
+    let found = solver::solve(matches, &blocks);
     let support = found.support();
     if support < MIN_SUPPORT {
         return MotionEstimate::none(matches.len(), support);
@@ -233,6 +236,23 @@ mod tests {
 
         assert!(apart.to_degrees() < 0.05, "{}°", apart.to_degrees());
         assert!(reading.motion.translation.vector.norm() < 0.005);
+    }
+
+    /// Oracle: the definition: matches of infinite deviation say nothing. 393 matches do not fill the last block.
+    #[test]
+    fn places_without_a_match_have_no_influence() {
+        let all = matches(&known_motion(), 0.002, true);
+        let mut silent = all.clone();
+        for match_ in &mut silent[393..] {
+            match_.deviation = f64::INFINITY;
+        }
+        let [few, silent] = [&all[..393], &silent[..]].map(by_matches);
+        assert!(few.is_estimated);
+        let apart = few.motion.inv_mul(&silent.motion);
+        assert!(apart.translation.vector.norm() < 1e-12 && apart.rotation.angle() < 1e-9);
+        assert!((few.covariance - silent.covariance).norm() < 1e-12);
+        // A match that fits anything has the weight 1.
+        assert!((silent.support - few.support - 7.0).abs() < 1e-9);
     }
 
     /// Oracle: the definition. Points of the second image without any relation to the first have no

@@ -563,6 +563,7 @@ async fn the_hnsw_index_answers_as_the_exact_one_here_and_says_what_it_is() {
         let b = hnsw.navigated(go).await;
         assert_eq!(a.steps, b.steps);
         assert!(a.exact && !b.exact);
+        assert_eq!([a.index.as_str(), b.index.as_str()], ["exact", "hnsw"]);
     }
 }
 
