@@ -47,7 +47,12 @@ pub struct Motion {
     #[arg(long, value_name = "FILE", requires = "rows")]
     feature_file: Option<PathBuf>,
     /// Two rows of the --feature-file, A,B, counted from 0
-    #[arg(long, value_delimiter = ',', value_name = "A,B")]
+    #[arg(
+        long,
+        value_delimiter = ',',
+        value_name = "A,B",
+        requires = "feature_file"
+    )]
     rows: Option<Vec<usize>>,
     /// Estimate the motion with the adapter's relational reader, which compares the cells of both
     /// feature maps and needs no camera

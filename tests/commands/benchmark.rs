@@ -70,7 +70,7 @@ fn submissions_are_scored_as_evaluate_scores() {
     );
     here.refuses(
         &format!("{check} --submission small.json"),
-        &["small.json", "submission"],
+        &["small.json", "unknown field `sha256`"],
     );
     let mut submission = here.json("paper.json");
     submission["frames"]["r"][5] = (-1).into();

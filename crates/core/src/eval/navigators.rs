@@ -116,7 +116,7 @@ pub struct Row {
     /// Scores of the retrieved frames.
     pub retrieval: RetrievalScores,
     /// For each ε, the difference of Hit@ε to that of Identity on the same pairs, with its 95 %
-    /// interval. Empty for Identity itself, and if Identity was not evaluated.
+    /// interval. Empty for Identity itself.
     pub hits_over_identity: Vec<(f64, MeanInterval)>,
     /// Whether these are no held-out scores; set by [`Report::marked`].
     pub leaks: bool,

@@ -18,8 +18,8 @@ use nalgebra::{Matrix6, Vector2, Vector3};
 
 use crate::matched_views::{ViewKeypoints, matched_keypoints, pixel_focal, plane_points};
 use seen::Matches;
+pub(crate) use seen::usual_log_inverse_depth;
 use seese3_core::geometry::{Pose, Twist, log, twist_covariance};
-pub(crate) use solver::usual_log_inverse_depth;
 
 /// Number of keypoints of each view that are matched.
 const CANDIDATES: usize = 600;

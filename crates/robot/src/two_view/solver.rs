@@ -4,17 +4,12 @@
 //! (v, ω) are applied on its right.
 
 use nalgebra::{
-    Cholesky, Matrix3, Matrix6, Rotation3, Translation3, UnitQuaternion, Vector2, Vector3, Vector6,
+    Cholesky, Matrix3, Matrix6, Rotation3, Translation3, UnitQuaternion, Vector3, Vector6,
 };
 
 use super::Match;
 use super::seen::{Hypothesis, Lanes, Matches, NormalEquations, Seen};
 use seese3_core::geometry::Pose;
-
-/// Prior mean of log ρ, ρ the inverse depth in 1/m, at a point (x, y) in normalized coordinates:
-/// coefficients of 1, x, y, x², xy and y². The edges of an image are nearer than its center. Fitted
-/// to drawn rooms and one photographed room.
-const LOG_INVERSE_DEPTH: [f64; 6] = [-0.9446, -0.1065, -0.0705, 0.4672, 0.0214, 0.2502];
 
 /// Candidate standard deviations of log ρ; the solution with the lowest cost is kept.
 const DEPTH_SPREADS: [f64; 2] = [0.15, 0.3];
@@ -306,16 +301,4 @@ impl<'a> Found<'a> {
         );
         Some((motion, spread * spread::ALL))
     }
-}
-
-/// Prior mean of log ρ at a point on the plane at depth 1.
-pub(crate) fn usual_log_inverse_depth(point: Vector2<f64>) -> f64 {
-    let [x, y] = [point.x, point.y];
-    let terms = [1.0, x, y, x * x, x * y, y * y];
-
-    LOG_INVERSE_DEPTH
-        .iter()
-        .zip(terms)
-        .map(|(factor, term)| factor * term)
-        .sum()
 }
