@@ -311,6 +311,7 @@ fn sums(blocks: &[Block], hypothesis: &Hypothesis, seen: &[SeenBlock]) -> Sums {
     sums
 }
 
+/// Adds the normal equations of a block.
 #[inline(always)]
 fn add_block(sums: &mut Sums, block: &Block, hypothesis: &Hypothesis, seen: &SeenBlock) {
     let Hypothesis {
@@ -331,31 +332,7 @@ fn add_block(sums: &mut Sums, block: &Block, hypothesis: &Hypothesis, seen: &See
         let [x, y] = [seen.expected[0][lane], seen.expected[1][lane]];
         let [rx, ry] = [seen.residual[0][lane], seen.residual[1][lane]];
         let [bx, by] = [seen.by_depth[0][lane], seen.by_depth[1][lane]];
-        let [dx, dy, dz] = [
-            seen.direction[0][lane],
-            seen.direction[1][lane],
-            seen.direction[2][lane],
-        ];
-        let inverse = 1.0 / seen.depth[lane];
-        let pull = -seen.inverse_depth[lane] * inverse;
-        // The derivatives by the direction are (1, 0, −x) and (0, 1, −y) over the depth; those by ω their cross
-        // products with the direction.
-        let by_x = [
-            pull,
-            0.0,
-            -x * pull,
-            x * inverse * dy,
-            -inverse * (dz + x * dx),
-            inverse * dy,
-        ];
-        let by_y = [
-            0.0,
-            pull,
-            -y * pull,
-            inverse * (dz + y * dy),
-            -y * inverse * dx,
-            -inverse * dx,
-        ];
+        let [by_x, by_y] = by_motion(seen, lane);
 
         let own = (bx * bx + by * by) / variance + depth_information;
         let weight = seen.weight[lane] / variance;
@@ -376,7 +353,7 @@ fn add_block(sums: &mut Sums, block: &Block, hypothesis: &Hypothesis, seen: &See
         slopes[0][lane] = weight * (rx - bx * slope / own);
         slopes[1][lane] = weight * (ry - by * slope / own);
 
-        let share = pull * depth_spread;
+        let share = depth_spread * seen.inverse_depth[lane] / seen.depth[lane];
         let share = share * share / variance / (1.0 + seen.depth_share[lane]);
         sums.shares[0][lane] += share;
         sums.shares[1][lane] += share * x;
@@ -397,6 +374,40 @@ fn add_block(sums: &mut Sums, block: &Block, hypothesis: &Hypothesis, seen: &See
                 rows[0][row][lane] * slopes[0][lane] + rows[1][row][lane] * slopes[1][lane];
         }
     }
+}
+
+/// Derivatives of a predicted point, x and y, by a small step (v, ω) of the second camera.
+#[inline(always)]
+fn by_motion(seen: &SeenBlock, lane: usize) -> [[f64; 6]; 2] {
+    let [x, y] = [seen.expected[0][lane], seen.expected[1][lane]];
+    let [dx, dy, dz] = [
+        seen.direction[0][lane],
+        seen.direction[1][lane],
+        seen.direction[2][lane],
+    ];
+    let inverse = 1.0 / seen.depth[lane];
+    let pull = -seen.inverse_depth[lane] * inverse;
+
+    // The derivatives by the direction are (1, 0, −x) and (0, 1, −y) over the depth; those by ω their cross
+    // products with the direction.
+    [
+        [
+            pull,
+            0.0,
+            -x * pull,
+            x * inverse * dy,
+            -inverse * (dz + x * dx),
+            inverse * dy,
+        ],
+        [
+            0.0,
+            pull,
+            -y * pull,
+            inverse * (dz + y * dy),
+            -y * inverse * dx,
+            -inverse * dx,
+        ],
+    ]
 }
 
 /// Prior mean of log ρ at a point on the plane at depth 1.
