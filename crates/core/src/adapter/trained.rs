@@ -299,13 +299,9 @@ impl Adapter {
             });
         }
 
-        // Without branches, so that the numbers are compared together.
-        let is_finite = features
-            .iter()
-            .fold(true, |is_finite, value| is_finite & value.is_finite());
-        let mut numbers = features.indexed_iter();
-        if !is_finite
-            && let Some(((_, position), &value)) = numbers.find(|(_, value)| !value.is_finite())
+        if let Some(((_, position), &value)) = features
+            .indexed_iter()
+            .find(|(_, value)| !value.is_finite())
         {
             return Err(Error::NotFinite {
                 what: "feature",
