@@ -430,7 +430,7 @@ pub fn check_reader(navigators: &[NavigatorKind], stored: &StoredAdapter) -> any
     let asks = navigators.contains(&NavigatorKind::Relational);
     ensure!(
         !asks || stored.adapter.relational().is_some(),
-        "adapter '{}' has no relational reader: name one that has with --adapter (`seese3 store show` lists it), or \
+        "adapter '{}' has no relational reader: name one that has with --adapter (`seese3 store list` says which), or \
          train one with --reader relational",
         stored.name
     );

@@ -86,12 +86,13 @@ pub(super) fn solve<'a>(matches: &[Match], blocks: &'a Matches) -> Found<'a> {
         let mut ends: Vec<Found<'_>> = STARTS
             .into_iter()
             .map(|start| {
-                let start = at(Vector3::from(start), 1.0, depth_spread);
+                let [(smoothest, steps), (smoother, more_steps)] = ANNEALING;
+                let start = at(Vector3::from(start), smoothest, depth_spread);
                 let mut found = Found::at(blocks, start, &usual);
-                for (factor, steps) in ANNEALING {
-                    found = found.with(factor, depth_spread);
-                    found.descend(steps);
-                }
+                found.descend(steps);
+
+                found = found.with(smoother, depth_spread);
+                found.descend(more_steps);
                 found.with(1.0, depth_spread)
             })
             .collect();
