@@ -1,6 +1,7 @@
 """The asynchronous client gives what the synchronous one gives, which is made from it."""
 
 import asyncio
+import os
 import signal
 from pathlib import Path
 
@@ -61,6 +62,7 @@ def test_a_step_that_is_given_up_did_not_happen(drawn: Path) -> None:
             for row, feature in enumerate(rows):
                 if row == given_up:
                     server._process.send_signal(signal.SIGSTOP)
+                    os.waitpid(server._process.pid, os.WUNTRACED)
                     with pytest.raises(asyncio.TimeoutError):
                         await asyncio.wait_for(track.step(feature, row * 33_000_000), 0.2)
                     server._process.send_signal(signal.SIGCONT)
