@@ -26,6 +26,8 @@ use seese3_core::navigation::{
     RetrievalMetric, Source, SourceAt, StepKind,
 };
 use seese3_core::room::{FrameId, Room};
+use seese3_core::splits::Split;
+use seese3_lab::probes::{MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe};
 use seese3_robot::matched_views::ViewKeypoints;
 use seese3_robot::two_view::estimate;
 use seese3_testing::keypoint_scene::{Random, Scene, camera_path, distorted_camera};
@@ -97,7 +99,7 @@ fn query(steps: u32) -> Query {
             RetrievalMetric::Full,
         ),
         fit_on: FitOn {
-            split: seese3_core::splits::Split::Time,
+            split: Split::Time,
             stride: 40,
         },
         top_k: 10,
@@ -218,77 +220,146 @@ fn scan(criterion: &mut Criterion) {
     group.finish();
 }
 
-/// An epoch of 30,000 pairs of 1,000 frames at 768 columns; the peer is its first layer's products
-/// alone, which no implementation can do without: one forward and one backward product for each
-/// distinct frame of each batch.
+/// An epoch of 30,000 pairs of 1,000 frames; the peer is its first layer's products alone, which no
+/// implementation can do without: one forward and one backward product for each distinct frame of each batch.
+/// Another peer is `benches/peers/training.py`. On each processor an epoch of its own, as in sweeps, should
+/// take as long as one alone.
 fn epoch(criterion: &mut Criterion) {
-    const PAIRS: usize = 30_000;
-
-    let (room, features) = room(1_000);
-    let mut random_rows = rand_chacha::ChaCha8Rng::seed_from_u64(4);
-
-    let pairs: Vec<[usize; 2]> = (0..PAIRS)
-        .map(|_| {
-            let source = random_rows.random_range(0..960usize);
-            [source, source + random_rows.random_range(10..=40usize)]
-        })
-        .collect();
-    let samples =
-        Samples::<f32>::new(features.rows(), room.poses().to_vec(), pairs.clone()).unwrap();
-
-    let widths = Widths {
-        feature: COLUMNS,
-        hidden: 64,
-        latent: 20,
-    };
-
-    let batches: Vec<Vec<usize>> = (0..PAIRS)
-        .collect::<Vec<_>>()
-        .chunks(512)
-        .map(<[usize]>::to_vec)
-        .collect();
-
     let mut group = criterion.benchmark_group("epoch");
     group.sample_size(10);
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    for columns in [256, 768] {
+        let data = EpochData::new(columns);
+        let mut trainer = data.trainer();
+        group.bench_function(BenchmarkId::new("train", columns), |bencher| {
+            bencher.iter(|| data.train(&mut trainer));
+        });
 
-    group.bench_function("train", |bencher| {
-        let mut trainer = Trainer::new(
-            &samples,
-            Mixture::initial(widths, 1, 0),
-            TrainConfig::default(),
+        let mut trainers: Vec<_> = (0..threads).map(|_| data.trainer()).collect();
+        group.bench_function(
+            BenchmarkId::new(format!("train-on-each-of-{threads}-processors"), columns),
+            |bencher| {
+                bencher.iter(|| {
+                    std::thread::scope(|scope| {
+                        for trainer in &mut trainers {
+                            scope.spawn(|| black_box(data.train(trainer)));
+                        }
+                    });
+                });
+            },
         );
 
-        bencher.iter(|| {
-            batches
-                .iter()
-                .map(|batch| trainer.step(batch).loss)
-                .sum::<f64>()
-        });
-    });
-
-    let weight = random(64, COLUMNS, 5).mapv(|x| x as f32);
-
-    let gathered: Vec<Array2<f32>> = batches
-        .iter()
-        .map(|batch| {
-            let mut rows: Vec<usize> = batch.iter().flat_map(|&pair| pairs[pair]).collect();
-            rows.sort_unstable();
-            rows.dedup();
-            features.rows().select(ndarray::Axis(0), &rows)
-        })
-        .collect();
-
-    group.bench_function("first-layer-products", |bencher| {
-        bencher.iter(|| {
-            for batch in &gathered {
-                let hidden = batch.dot(&weight.t());
-                black_box(hidden.t().dot(batch));
-            }
-        });
-    });
+        let weight = random(64, columns, 5).mapv(|x| x as f32);
+        let gathered = data.gathered();
+        group.bench_function(
+            BenchmarkId::new("first-layer-products", columns),
+            |bencher| {
+                bencher.iter(|| {
+                    for batch in &gathered {
+                        let hidden = batch.dot(&weight.t());
+                        black_box(hidden.t().dot(batch));
+                    }
+                });
+            },
+        );
+    }
 
     group.finish();
 }
 
-criterion_group!(benches, one_answer, relational, two_views, scan, epoch);
+struct EpochData {
+    columns: usize,
+    pairs: Vec<[usize; 2]>,
+    features: Array2<f32>,
+    samples: Samples<f32>,
+    batches: Vec<Vec<usize>>,
+}
+
+impl EpochData {
+    const PAIRS: usize = 30_000;
+    const BATCH: usize = 512;
+
+    fn new(columns: usize) -> Self {
+        let (room, _) = room(1_000);
+        let features = random(1_000, columns, 6).mapv(|x| x as f32);
+        let mut rows = rand_chacha::ChaCha8Rng::seed_from_u64(4);
+        let pairs: Vec<[usize; 2]> = (0..Self::PAIRS)
+            .map(|_| {
+                let source = rows.random_range(0..960usize);
+                [source, source + rows.random_range(10..=40usize)]
+            })
+            .collect();
+
+        let every: Vec<usize> = (0..Self::PAIRS).collect();
+        let poses = room.poses().to_vec();
+        Self {
+            columns,
+            samples: Samples::new(features.view(), poses, pairs.clone()).unwrap(),
+            features,
+            pairs,
+            batches: every.chunks(Self::BATCH).map(<[usize]>::to_vec).collect(),
+        }
+    }
+
+    fn trainer(&self) -> Trainer<'_, f32, Mixture<f32>> {
+        let widths = Widths {
+            feature: self.columns,
+            hidden: 64,
+            latent: 20,
+        };
+        let network = Mixture::initial(widths, 1, 0);
+        Trainer::new(&self.samples, network, TrainConfig::default())
+    }
+
+    fn train(&self, trainer: &mut Trainer<'_, f32, Mixture<f32>>) -> f64 {
+        let batches = self.batches.iter();
+        batches.map(|batch| trainer.step(batch).loss).sum()
+    }
+
+    /// The features of each batch's distinct frames.
+    fn gathered(&self) -> Vec<Array2<f32>> {
+        let of_batch = |batch: &Vec<usize>| {
+            let mut rows: Vec<usize> = batch.iter().flat_map(|&pair| self.pairs[pair]).collect();
+            rows.sort_unstable();
+            rows.dedup();
+            self.features.select(ndarray::Axis(0), &rows)
+        };
+        self.batches.iter().map(of_batch).collect()
+    }
+}
+
+/// M1 to M3 of 5,000 frames; the peer is `benches/peers/probes.py`.
+fn probes(criterion: &mut Criterion) {
+    const FRAMES: usize = 5_000;
+    const COLUMNS: usize = 768;
+
+    let (room, _) = room(FRAMES);
+    let mut noise = rand_chacha::ChaCha8Rng::seed_from_u64(5);
+    let features = Array2::from_shape_fn((FRAMES, COLUMNS), |(row, column)| {
+        let t = row as f64 / FRAMES as f64;
+        let smooth = (40.0 * t * (1 + column % 7) as f64 + column as f64).sin();
+        (smooth + noise.random_range(-0.05..0.05)) as f32
+    });
+
+    let mut group = criterion.benchmark_group("probes");
+    group.sample_size(10);
+    let options = MutualKnn {
+        frames: FRAMES,
+        ..MutualKnn::default()
+    };
+    group.bench_function("m1", |bencher| {
+        bencher.iter(|| mutual_knn(features.view(), room.poses(), &options).unwrap());
+    });
+    group.bench_function("m2", |bencher| {
+        bencher.iter(|| intrinsic_dimension(features.view(), 10).unwrap());
+    });
+    group.bench_function("m3", |bencher| {
+        bencher.iter(|| ridge_probe(features.view(), &room, Split::Time, 10).unwrap());
+    });
+    group.finish();
+}
+
+criterion_group!(
+    benches, one_answer, relational, two_views, scan, epoch, probes
+);
 criterion_main!(benches);

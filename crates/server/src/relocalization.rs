@@ -1,6 +1,7 @@
 //! LocalizationService.Relocalize: finds a camera's room and its pose there without a prior. Also
 //! selects the rooms and maps for Track.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use tonic::{Request, Response, Status};
@@ -15,6 +16,7 @@ use super::{Error, Handlers};
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
 use seese3_core::navigation::RetrievedFrame;
+use seese3_core::room::RoomId;
 use seese3_robot::localization::{LocatedView, NotLocated, PoseEstimate};
 use seese3_robot::tracking::{
     self, Map, MapQuery, ROOM_RATIO, Relocalization, RoomMatch, relocalize,
@@ -95,7 +97,7 @@ fn answer(
 
     // Then compare latents. Without them, keypoints still answer.
     let compared = rooms_with_maps(snapshot, &rooms, &adapter)
-        .and_then(|served| ByLatent::of(served, views, top_k, snapshot, cancel));
+        .and_then(|served| ByLatent::of(served, views, snapshot, cancel));
     let by_latent = match compared {
         Err(Error::Precondition(_) | Error::Invalid { .. })
             if adapter.is_empty() && matches.rooms().next().is_some() =>
@@ -104,7 +106,14 @@ fn answer(
         }
         compared => Some(compared?),
     };
-    ranked(&matches, by_latent.as_ref(), shown)
+    ranked(
+        &matches,
+        by_latent.as_ref(),
+        Shown {
+            rooms: shown,
+            frames: top_k,
+        },
+    )
 }
 
 /// Rooms under one adapter, each with its map.
@@ -134,13 +143,12 @@ impl ByLatent {
     fn of(
         RoomsWithMaps { served, maps }: RoomsWithMaps,
         views: Vec<pb::View>,
-        top_k: usize,
         snapshot: &Snapshot,
         cancel: &Cancellation,
     ) -> Result<Self, Error> {
         let mut views = embedded(views, &served[0].adapter, snapshot, cancel)?;
         let queries: Vec<MapQuery<'_>> = views.iter().map(query_of).collect();
-        let found = relocalize(&maps, &queries, top_k, cancel).map_err(|error| match error {
+        let found = relocalize(&maps, &queries, cancel).map_err(|error| match error {
             tracking::Error::Cancelled => Error::Cancelled,
             _ => Error::Internal,
         })?;
@@ -169,19 +177,36 @@ fn query_of(view: &EmbeddedView) -> MapQuery<'_> {
     }
 }
 
+/// How much an answer shows.
+#[derive(Clone, Copy)]
+struct Shown {
+    rooms: usize,
+    /// Frames of a room.
+    frames: usize,
+}
+
 /// Ranks the rooms: first those in which the keypoints of the newest view give a pose, by their
 /// inliers, then the others by the distance of latents.
 fn ranked(
     matches: &RoomMatches,
     by_latent: Option<&ByLatent>,
-    shown: usize,
+    shown: Shown,
 ) -> Result<pb::RelocalizeResponse, Error> {
     let mut rooms: Vec<pb::RoomMatch> = matches.located.iter().map(located_to_wire).collect();
+    let mut compared: BTreeSet<&RoomId> =
+        matches.located.iter().map(|(room, _)| &room.id).collect();
 
     for (room, served) in by_latent.iter().flat_map(|compared| compared.rooms()) {
-        let why = matches.why_not_in(served.navigator.room().id());
+        let id = served.navigator.room().id();
+        let is_located = !compared.insert(id);
+        if !is_located && rooms.len() >= shown.rooms {
+            continue;
+        }
+
+        let why = matches.why_not_in(id);
         let newest = by_latent.map(|compared| &compared.newest);
-        let wire = room_to_wire(room, served, newest.ok_or(Error::Internal)?, why)?;
+        let newest = newest.ok_or(Error::Internal)?;
+        let wire = room_to_wire(room, served, newest, shown.frames, why)?;
         match rooms.iter_mut().find(|known| known.room == wire.room) {
             Some(known) => {
                 known.distance = wire.distance;
@@ -193,22 +218,18 @@ fn ranked(
     }
 
     for (room, why) in &matches.unmatched {
-        let revision = convert::served_revision(room);
-        if !rooms
-            .iter()
-            .any(|known| known.room.as_ref() == Some(&revision))
-        {
+        if compared.insert(&room.id) {
             let nowhere = PoseEstimate::choose(Some(Err(*why)), || None);
             rooms.push(match_to_wire(
-                revision,
+                convert::served_revision(room),
                 LocatedPose::of(nowhere, room.id.as_str()),
             ));
         }
     }
 
     let verdict = verdict(matches, by_latent);
-    let room_count = rooms.len() as u32;
-    rooms.truncate(shown);
+    let room_count = compared.len() as u32;
+    rooms.truncate(shown.rooms);
     Ok(pb::RelocalizeResponse {
         adapter: by_latent.map(|found| convert::adapter_revision(&found.served[0])),
         rooms,
@@ -421,6 +442,7 @@ fn room_to_wire(
     found: &RoomMatch,
     served: &ServedNavigator,
     newest: &EmbeddedView,
+    frames: usize,
     unmatched: Option<NotLocated>,
 ) -> Result<pb::RoomMatch, Error> {
     let room = served.navigator.room();
@@ -431,6 +453,7 @@ fn room_to_wire(
     let mut located = LocatedPose::of(estimate, room.id().as_str());
     located.add_fitted(served, query.feature)?;
 
+    let matched = served.map.as_ref().map(|map| map.match_view(query, frames));
     // Distances are in standard deviations of frame noise, unlike those of Localize.
     let retrieved = |neighbor: &seese3_core::index::Neighbor| {
         let retrieved = RetrievedFrame {
@@ -442,7 +465,11 @@ fn room_to_wire(
     Ok(pb::RoomMatch {
         distance: Some(found.distance),
         distance_ratio: Some(found.out_of_distribution),
-        frames: found.last.nearest.iter().map(retrieved).collect(),
+        frames: matched
+            .iter()
+            .flat_map(|found| &found.nearest)
+            .map(retrieved)
+            .collect(),
         ..match_to_wire(convert::room_revision(served), located)
     })
 }

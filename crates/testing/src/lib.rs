@@ -26,7 +26,7 @@ use seese3_core::geometry::{Pose, nearest_rotation};
 
 /// Deterministic noise in [-1, 1), from `seed` and `place`.
 #[cfg(feature = "world")]
-pub(crate) fn noise(seed: u64, place: usize) -> f64 {
+pub fn noise(seed: u64, place: usize) -> f64 {
     let mixed = (seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ place as u64)
         .wrapping_mul(0xbf58_476d_1ce4_e5b9);
     ((mixed ^ (mixed >> 29)).wrapping_mul(0x94d0_49bb_1331_11eb) >> 40) as f64 / f64::from(1 << 23)

@@ -1,11 +1,12 @@
 //! The network φ: Linear(d, 64) → LayerNorm(64) → GELU (erf) → Linear(64, 20), with hand-written
 //! forward and backward passes.
 
-use ndarray::{Array2, Axis};
+use ndarray::{Array1, Array2, Axis};
 
 use super::Real;
 use super::layers::{
     cumulative, gelu_backward, linear, linear_initial, normalize, normalize_backward,
+    wide_dot_products,
 };
 use super::seeded::Seeded;
 
@@ -157,16 +158,13 @@ impl<T: Real> Phi<T> {
 
     /// The forward pass of feature rows, shape (n, d).
     pub fn forward(&self, input: &Array2<T>) -> Activations<T> {
-        let [
-            first_weight,
-            first_bias,
-            norm_weight,
-            norm_bias,
-            last_weight,
-            last_bias,
-        ] = &self.tensors;
+        let [weight, bias, ..] = &self.tensors;
+        self.after_first_layer(linear(input, weight, bias))
+    }
 
-        let mut normalized = linear(input, first_weight, first_bias);
+    /// The forward pass from the output of the first layer on, shape (n, h).
+    fn after_first_layer(&self, mut normalized: Array2<T>) -> Activations<T> {
+        let [_, _, norm_weight, norm_bias, last_weight, last_bias] = &self.tensors;
         let inverse_deviation = normalize(&mut normalized);
         let scaled = &normalized * norm_weight + norm_bias;
 
@@ -228,5 +226,19 @@ impl<T: Real> Phi<T> {
     ) {
         self.backward(input, forward, d_latents, gradient);
         gradient.tensors[5] += &d_latents.sum_axis(Axis(0));
+    }
+}
+
+impl Phi<f32> {
+    /// φ of one feature in f64, shape (1, k): to the bit [`Phi::forward`] of `wide`, which has the same
+    /// weights in f64. `None` if a number of the feature is not finite.
+    pub(super) fn of_one(&self, wide: &Phi<f64>, feature: &[f32]) -> Option<Array2<f64>> {
+        let weight = self.tensors[0].as_slice()?;
+        let first = Array1::from(wide_dot_products(weight, feature)).insert_axis(Axis(0));
+        let first = first + &wide.tensors[1];
+
+        // Each number of the feature is multiplied by a weight in every sum.
+        let is_finite = first.first().is_some_and(|sum| sum.is_finite());
+        is_finite.then(|| wide.after_first_layer(first).latents)
     }
 }

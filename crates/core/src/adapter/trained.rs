@@ -299,6 +299,10 @@ impl Adapter {
             });
         }
 
+        if let Some(latent) = self.embed_single(features) {
+            return Ok(latent);
+        }
+
         if let Some(((_, position), &value)) = features
             .indexed_iter()
             .find(|(_, value)| !value.is_finite())
@@ -317,6 +321,16 @@ impl Adapter {
         }
 
         Ok(latents)
+    }
+
+    /// The latent of a single feature by a single chart: the weights of the first layer, most of a request's
+    /// memory, are read in f32. `None` for others, and if a number is not finite.
+    fn embed_single(&self, features: ArrayView2<'_, f32>) -> Option<Array2<f64>> {
+        let ([chart], [wide]) = (self.network.charts(), self.network_f64.charts()) else {
+            return None;
+        };
+        let feature = features.as_slice().filter(|_| features.nrows() == 1)?;
+        chart.phi.of_one(&wide.phi, feature)
     }
 
     /// The latent φ(z) of one feature.

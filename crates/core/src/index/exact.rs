@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use ndarray::{Array2, ArrayView2, Axis};
 
-use super::scores::{LANES, ScoredRows, Scores};
+use super::scores::{LANES, ScoredQuery, ScoredRows};
 use super::{Exclusion, Index, Nearest, Neighbor, distance};
 use crate::room::FrameId;
 
@@ -14,9 +14,9 @@ const QUERIES: usize = 4;
 
 /// Latents by row, and the frame of each row.
 ///
-/// A query first computes scores of all rows in f32. The rows whose scores are low enough to be among the
-/// nearest, in spite of the error of f32, are compared in f64. Answers and their order are those of a scan in
-/// f64.
+/// A query first computes a lower bound for each block of rows, in f32. The blocks are searched in the order of
+/// their bounds, until none can hold a row that is nearer than those found: first in f32, then, for the rows
+/// that are near enough in spite of the error of f32, in f64. Answers and their order are those of a scan in f64.
 #[derive(Debug, Clone)]
 pub struct ExactIndex {
     /// In ascending order.
@@ -54,7 +54,7 @@ impl ExactIndex {
         })
     }
 
-    /// The nearest of some queries that are compared with all rows in one pass.
+    /// The nearest of some queries whose bounds are computed in one pass over the rows.
     fn nearest_in_one_pass<const QUERIES: usize>(
         &self,
         queries: [&[f64]; QUERIES],
@@ -62,53 +62,19 @@ impl ExactIndex {
         exclusion: Option<Exclusion>,
     ) -> [Vec<Neighbor>; QUERIES] {
         let excluded = self.positions(exclusion);
-        let mut scores = self.rows.scores(queries);
-        for position in excluded.clone() {
-            for scores in &mut scores[position / LANES] {
-                scores[position % LANES] = f32::INFINITY;
-            }
-        }
+        let scored = queries.map(|query| self.rows.query(query));
+        let bounds = self.rows.least_bounds(scored.each_ref());
 
         std::array::from_fn(|which| {
-            let mut nearest = Nearest::new(k);
-            for position in self.candidates(&scores, which, k, queries[which]) {
-                if !excluded.contains(&position) {
-                    nearest.offer(self.neighbor(position, queries[which]));
-                }
-            }
-            nearest.found()
+            let search = Search {
+                index: self,
+                query: queries[which],
+                scored: &scored[which],
+                excluded: excluded.clone(),
+                nearest: Nearest::new(k),
+            };
+            search.found(bounds.iter().map(|bounds| bounds[which]))
         })
-    }
-
-    /// Positions that include those of the `k` nearest rows.
-    fn candidates<const QUERIES: usize>(
-        &self,
-        scores: &Scores<QUERIES>,
-        which: usize,
-        k: usize,
-        query: &[f64],
-    ) -> Vec<usize> {
-        let error = self.rows.error(query);
-        let kth = kth_score_at_most(scores, which, k).filter(|_| error.is_finite());
-        let Some(kth) = kth else {
-            return (0..self.frames.len()).collect();
-        };
-
-        // Both scores of a comparison may be wrong.
-        let bound = ((f64::from(kth) + 2.0 * error) as f32).next_up();
-        let mut found = Vec::new();
-        for (block, scores) in scores.iter().enumerate() {
-            let scores = scores[which];
-            // Without branches, so that the rows are compared together.
-            if scores
-                .iter()
-                .fold(false, |is_any, &score| is_any | (score <= bound))
-            {
-                let near = (0..LANES).filter(|&lane| scores[lane] <= bound);
-                found.extend(near.map(|lane| block * LANES + lane));
-            }
-        }
-        found
     }
 
     fn neighbor(&self, position: usize, query: &[f64]) -> Neighbor {
@@ -137,31 +103,74 @@ impl ExactIndex {
     }
 }
 
-/// An upper bound of the `k`-th least score of a query; `None` if it cannot be told, as for few rows.
-fn kth_score_at_most<const QUERIES: usize>(
-    scores: &Scores<QUERIES>,
-    which: usize,
-    k: usize,
-) -> Option<f32> {
-    // At least k rows have scores up to the k-th of the least scores of parts of the rows. Each lane of some
-    // blocks is a part; with 2k times as many parts as lanes, the bound is low.
-    let blocks = scores.len() / k.saturating_mul(2).max(1);
-    let mut least: Vec<f32> = scores
-        .chunks(blocks.max(1))
-        .flat_map(|blocks| {
-            let mut least = [f32::INFINITY; LANES];
-            for block in blocks {
-                for (least, &score) in least.iter_mut().zip(&block[which]) {
-                    *least = least.min(score);
-                }
-            }
-            least
-        })
-        .collect();
+/// The search for one query's nearest rows.
+struct Search<'a> {
+    index: &'a ExactIndex,
+    query: &'a [f64],
+    scored: &'a ScoredQuery,
+    /// Positions that are not answers.
+    excluded: Range<usize>,
+    nearest: Nearest,
+}
 
-    let place = k.checked_sub(1).filter(|&place| place < least.len())?;
-    let (_, &mut kth, _) = least.select_nth_unstable_by(place, f32::total_cmp);
-    kth.is_finite().then_some(kth)
+impl Search<'_> {
+    /// The nearest rows, given the least lower bound of each block's scores.
+    fn found(mut self, bounds: impl Iterator<Item = f32>) -> Vec<Neighbor> {
+        let mut blocks: Vec<(f32, usize)> = bounds.zip(0..).collect();
+        if !self.scored.has_scores() {
+            (0..blocks.len()).for_each(|block| self.look_at(block));
+            return self.nearest.found();
+        }
+
+        // Blocks that have enough rows for an answer, unless a lower bound was far too low.
+        let wanted = self.nearest.count().saturating_add(self.excluded.len());
+        let first = (wanted.div_ceil(LANES) + 1).min(blocks.len());
+        if first < blocks.len() {
+            blocks.select_nth_unstable_by(first, |a, b| a.0.total_cmp(&b.0));
+        }
+        let (first, rest) = blocks.split_at_mut(first);
+        self.look_at_each(first);
+
+        let limit = self.limit();
+        let mut near: Vec<(f32, usize)> = rest
+            .iter()
+            .copied()
+            .filter(|&(bound, _)| bound <= limit)
+            .collect();
+        self.look_at_each(&mut near);
+        self.nearest.found()
+    }
+
+    /// Looks at blocks, the likeliest first, as long as they can hold an answer.
+    fn look_at_each(&mut self, blocks: &mut [(f32, usize)]) {
+        blocks.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
+        for &(bound, block) in &*blocks {
+            if bound > self.limit() {
+                break;
+            }
+            self.look_at(block);
+        }
+    }
+
+    /// Offers the rows of a block that can be answers.
+    fn look_at(&mut self, block: usize) {
+        let limit = self.limit();
+        let scores = self.index.rows.scores(block, self.scored);
+        let positions = block * LANES..self.index.frames.len().min((block + 1) * LANES);
+        for (position, score) in positions.zip(scores) {
+            let can_be_near = score <= limit || !self.scored.has_scores();
+            if can_be_near && !self.excluded.contains(&position) {
+                self.nearest
+                    .offer(self.index.neighbor(position, self.query));
+            }
+        }
+    }
+
+    /// The most that the score of an answer can be.
+    fn limit(&self) -> f32 {
+        let worst = self.nearest.worst();
+        worst.map_or(f32::INFINITY, |worst| self.scored.score_at(worst))
+    }
 }
 
 impl Index for ExactIndex {

@@ -132,6 +132,20 @@ impl Nearest {
         }
     }
 
+    /// The number that is collected.
+    fn count(&self) -> usize {
+        self.count
+    }
+
+    /// The largest distance collected; `None` while there are fewer than the wanted number.
+    fn worst(&self) -> Option<f64> {
+        let is_full = self.best.len() == self.count;
+        self.best
+            .last()
+            .filter(|_| is_full)
+            .map(|worst| worst.distance)
+    }
+
     /// Adds a neighbor if it is among the nearest so far.
     #[inline]
     pub fn offer(&mut self, found: Neighbor) {

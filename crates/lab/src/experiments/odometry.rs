@@ -205,10 +205,10 @@ pub fn relocalization(rooms: &[TrackedRoom<'_>]) -> Result<Relocalization, Error
                 latent: latents.row(frame.row()),
                 feature: Some(&feature),
             };
-            let answer = relocalize(&maps, &[view], 1, &Cancellation::default())?;
+            let answer = relocalize(&maps, &[view], &Cancellation::default())?;
 
             if !others.is_empty() {
-                let answer = relocalize(&others, &[view], 1, &Cancellation::default())?;
+                let answer = relocalize(&others, &[view], &Cancellation::default())?;
                 found.named_without_own += usize::from(!answer.ambiguous);
             }
 
@@ -216,7 +216,7 @@ pub fn relocalization(rooms: &[TrackedRoom<'_>]) -> Result<Relocalization, Error
                 found.ambiguous += 1;
             } else if answer.rooms[0].map == place {
                 found.right += 1;
-                found.add_pose(&answer.rooms[0].last, room, *frame);
+                found.add_pose(&answer.best, room, *frame);
             } else {
                 found.wrong += 1;
             }

@@ -1,15 +1,12 @@
 //! M2: the intrinsic dimension of the feature manifold.
-//!
-//! Distances are computed directly, in f64. The expansion ‖x‖² − 2xy + ‖y‖² cancels for near
-//! duplicate rows and yields meaningless dimensions.
 
 use std::collections::HashSet;
 
 use ndarray::{ArrayView2, Axis};
-use rayon::prelude::*;
 use serde::Serialize;
 
 use super::Error;
+use super::nearest_rows::{TooFewCandidates, nearest_rows};
 use seese3_core::statistics::{mean, median};
 
 /// Number of neighbors K of the maximum-likelihood estimate.
@@ -91,38 +88,15 @@ pub fn intrinsic_dimension(
     }
 
     let points = all.select(Axis(0), &kept);
-    let nearest = |row: usize| -> Result<Vec<f64>, Error> {
-        let here = points.row(row);
-        let mut squares: Vec<f64> = (0..points.nrows())
-            .filter(|&other| kept[other].abs_diff(kept[row]) > gap)
-            .map(|other| {
-                here.iter()
-                    .zip(points.row(other))
-                    .map(|(x, y)| (x - y) * (x - y))
-                    .sum()
-            })
-            .collect();
-
-        if squares.len() < MLE_NEIGHBORS {
-            return Err(Error::TooFewCandidates {
-                frame: kept[row],
-                k: MLE_NEIGHBORS,
-                exclusion: gap,
-            });
-        }
-
-        // Select the K nearest in linear time, then sort only these.
-        squares.select_nth_unstable_by(MLE_NEIGHBORS - 1, f64::total_cmp);
-        squares.truncate(MLE_NEIGHBORS);
-        squares.sort_by(f64::total_cmp);
-
-        Ok(squares.into_iter().map(f64::sqrt).collect())
-    };
-
-    let distances: Vec<Vec<f64>> = (0..points.nrows())
-        .into_par_iter()
-        .map(nearest)
-        .collect::<Result<_, _>>()?;
+    let apart = |row: usize, other: usize| kept[other].abs_diff(kept[row]) > gap;
+    let found = nearest_rows(points.view(), MLE_NEIGHBORS, apart);
+    let found = found.map_err(|TooFewCandidates { row }| Error::TooFewCandidates {
+        frame: kept[row],
+        k: MLE_NEIGHBORS,
+        exclusion: gap,
+    })?;
+    let distances_of = |found: Vec<(f64, usize)>| found.into_iter().map(|(d, _)| d).collect();
+    let distances: Vec<Vec<f64>> = found.into_iter().map(distances_of).collect();
 
     Ok(IntrinsicDimension {
         two_nn: two_nn(&distances),

@@ -3,6 +3,7 @@
 
 mod intrinsic_dimension;
 mod mutual_knn;
+mod nearest_rows;
 mod ridge_probe;
 
 pub use intrinsic_dimension::{IntrinsicDimension, Mle, TwoNn, intrinsic_dimension};

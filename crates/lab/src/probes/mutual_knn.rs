@@ -1,11 +1,12 @@
 //! M1: overlap between the nearest neighbors by feature and by pose. It measures whether frames
 //! with similar features have similar poses.
 
-use ndarray::{ArrayView2, Axis};
+use ndarray::{Array2, ArrayView2, Axis};
 use rayon::prelude::*;
 use serde::Serialize;
 
 use super::Error;
+use super::nearest_rows::{TooFewCandidates, nearest_rows};
 use seese3_core::geometry::{Pose, body_twist};
 
 /// The options of M1.
@@ -88,6 +89,14 @@ impl MutualKnn {
 
         frame != other && !near
     }
+
+    fn too_few_candidates(&self, frame: usize) -> Error {
+        Error::TooFewCandidates {
+            frame,
+            k: self.k,
+            exclusion: self.exclusion,
+        }
+    }
 }
 
 impl Default for MutualKnn {
@@ -150,18 +159,8 @@ pub fn feature_neighbors(
         row /= norm;
     }
 
-    // Sum in the same order for every pair, so that identical rows have exactly equal distances to
-    // any other row.
-    let distance = |a: usize, b: usize| {
-        1.0 - units
-            .row(a)
-            .iter()
-            .zip(units.row(b))
-            .map(|(x, y)| x * y)
-            .sum::<f64>()
-    };
-
-    neighbors(options, distance)
+    // ‖x − y‖² = 2 − 2 x·y for units: the order of the distances is that of the cosines.
+    nearest(units.view(), options)
 }
 
 /// The k nearest neighbors of each sampled frame by pose, nearest first.
@@ -179,20 +178,11 @@ pub fn pose_neighbors(poses: &[Pose], options: &MutualKnn) -> Result<Vec<Vec<usi
     let sampled = sampled(poses.len(), options)?;
     if options.pose_distance == PoseDistance::Twist {
         let twist = |a: usize, b: usize| body_twist(&poses[sampled[a]], &poses[sampled[b]]);
-        return neighbors(options, |a, b| twist(a, b).to_vector().norm());
+        return nearest_by(options, |a, b| twist(a, b).to_vector().norm());
     }
 
     let points: Vec<[f64; 9]> = sampled.into_iter().map(nine).collect();
-    let distance = |a: usize, b: usize| {
-        points[a]
-            .iter()
-            .zip(&points[b])
-            .map(|(x, y)| (x - y) * (x - y))
-            .sum::<f64>()
-            .sqrt()
-    };
-
-    neighbors(options, distance)
+    nearest(Array2::from(points).view(), options)
 }
 
 fn sampled(have: usize, options: &MutualKnn) -> Result<Vec<usize>, Error> {
@@ -222,38 +212,38 @@ fn sampled(have: usize, options: &MutualKnn) -> Result<Vec<usize>, Error> {
     Ok((0..frames).map(|frame| frame * stride).collect())
 }
 
-fn neighbors(
+/// The k nearest rows of each row.
+fn nearest(rows: ArrayView2<'_, f64>, options: &MutualKnn) -> Result<Vec<Vec<usize>>, Error> {
+    let apart = |frame: usize, other: usize| options.apart(frame, other);
+    let found = nearest_rows(rows, options.k, apart);
+    let found = found.map_err(|TooFewCandidates { row }| options.too_few_candidates(row))?;
+    let frames_of = |found: Vec<(f64, usize)>| found.into_iter().map(|(_, frame)| frame).collect();
+    Ok(found.into_iter().map(frames_of).collect())
+}
+
+/// The k nearest frames of each frame by a distance of pairs.
+fn nearest_by(
     options: &MutualKnn,
     distance: impl Fn(usize, usize) -> f64 + Sync,
 ) -> Result<Vec<Vec<usize>>, Error> {
-    let &MutualKnn {
-        frames,
-        k,
-        exclusion,
-        ..
-    } = options;
-
     let of = |frame: usize| {
         let apart = |other: &usize| options.apart(frame, *other);
-        let mut others: Vec<(f64, usize)> = (0..frames)
+        let mut others: Vec<(f64, usize)> = (0..options.frames)
             .filter(apart)
             .map(|other| (distance(frame, other), other))
             .collect();
 
-        if others.len() < k {
-            return Err(Error::TooFewCandidates {
-                frame,
-                k,
-                exclusion,
-            });
+        if others.len() < options.k {
+            return Err(options.too_few_candidates(frame));
         }
 
         // Ties go to the smaller frame number, so that the result is deterministic.
         others.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        Ok(others.into_iter().take(k).map(|(_, other)| other).collect())
+        let nearest = others.into_iter().take(options.k);
+        Ok(nearest.map(|(_, other)| other).collect())
     };
 
-    (0..frames).into_par_iter().map(of).collect()
+    (0..options.frames).into_par_iter().map(of).collect()
 }
 
 #[cfg(test)]

@@ -305,6 +305,22 @@ impl Map {
         self.index.memory_bytes() + by_appearance
     }
 
+    /// Distance of a view's latent from the nearest mapped frame, in standard deviations of frame noise; infinite
+    /// without mapped frames.
+    pub fn distance(&self, latent: ArrayView1<'_, f64>) -> f64 {
+        let nearest = self.index.nearest(&self.whitened(latent), 1, None);
+        nearest
+            .first()
+            .map_or(f64::INFINITY, |nearest| nearest.distance)
+    }
+
+    /// A distance from the nearest mapped frame, divided by the room's limit: above 1, a view is out of
+    /// distribution.
+    pub fn out_of_distribution(&self, distance: f64) -> f64 {
+        let limit = self.error_model.statistics().out_of_distribution_ratio;
+        distance / self.typical_distance / limit
+    }
+
     /// Matches a view with its `count` most similar mapped frames.
     pub fn match_view(&self, query: MapQuery<'_>, count: usize) -> MapMatch {
         let whitened = self.whitened(query.latent);
@@ -320,7 +336,7 @@ impl Map {
         let limits = self.error_model.statistics();
         let distance = by_latent[0].distance;
         let relative_distance = distance / self.typical_distance;
-        let out_of_distribution = relative_distance / limits.out_of_distribution_ratio;
+        let out_of_distribution = self.out_of_distribution(distance);
 
         let blend = Blend::of(&self.navigator, &by_latent, None);
         let by_feature = self.by_appearance.as_ref().zip(query.feature);

@@ -14,6 +14,8 @@ pub const ROOM_RATIO: f64 = 0.9;
 pub struct Relocalization {
     /// The rooms, best match first.
     pub rooms: Vec<RoomMatch>,
+    /// Match of the newest view with the best room.
+    pub best: MapMatch,
     /// Distance to the second room divided by the distance to the best; infinite with one room.
     pub margin: f64,
     /// Whether the best room must not be used: it is out of distribution, another room matches
@@ -33,12 +35,10 @@ pub struct RoomMatch {
     /// Mean of the views' distances divided by the room's limit: above 1 they are out of
     /// distribution.
     pub out_of_distribution: f64,
-    /// Match of the newest view.
-    pub last: MapMatch,
 }
 
-/// Ranks rooms by one or more views, newest last; the camera must hardly move between them. `top_k`
-/// frames are returned for the newest view.
+/// Ranks rooms by one or more views, newest last; the camera must hardly move between them. In each room only the
+/// nearest latent of each view is searched; the best room is matched in full.
 ///
 /// # Errors
 /// [`Error::NoMap`] without a map, [`Error::NoView`] without a view, [`Error::Adapters`] if the
@@ -46,11 +46,10 @@ pub struct RoomMatch {
 pub fn relocalize(
     maps: &[Arc<Map>],
     views: &[MapQuery<'_>],
-    top_k: usize,
     cancel: &Cancellation,
 ) -> Result<Relocalization, Error> {
     let adapter = maps.first().ok_or(Error::NoMap)?.navigator().adapter();
-    let (newest, earlier) = views.split_last().ok_or(Error::NoView)?;
+    let newest = views.last().ok_or(Error::NoView)?;
     if maps
         .iter()
         .any(|map| !Arc::ptr_eq(map.navigator().adapter(), adapter))
@@ -61,33 +60,26 @@ pub fn relocalize(
     let mut rooms = Vec::with_capacity(maps.len());
     for (place, map) in maps.iter().enumerate() {
         cancel.check().map_err(|_| Error::Cancelled)?;
-        let last = map.match_view(*newest, top_k);
-        let mut distance = last.distance;
-        let mut out_of_distribution = last.out_of_distribution;
-
-        for view in earlier {
-            cancel.check().map_err(|_| Error::Cancelled)?;
-            let matched = map.match_view(*view, 1);
-            distance += matched.distance;
-            out_of_distribution += matched.out_of_distribution;
-        }
-
-        let count = views.len() as f64;
+        let distance = views
+            .iter()
+            .map(|view| map.distance(view.latent))
+            .sum::<f64>();
+        let distance = distance / views.len() as f64;
         rooms.push(RoomMatch {
             map: place,
-            distance: distance / count,
-            out_of_distribution: out_of_distribution / count,
-            last,
+            distance,
+            out_of_distribution: map.out_of_distribution(distance),
         });
     }
 
     rooms.sort_by(|a, b| a.distance.total_cmp(&b.distance).then(a.map.cmp(&b.map)));
 
-    Ok(judged(rooms))
+    let matched = maps[rooms[0].map].match_view(*newest, 1);
+    Ok(judged(rooms, matched))
 }
 
-/// Adds to ranked rooms whether the first one is ambiguous, and why.
-fn judged(rooms: Vec<RoomMatch>) -> Relocalization {
+/// Adds to ranked rooms whether the first one, which the newest view matches so, is ambiguous, and why.
+fn judged(rooms: Vec<RoomMatch>, matched: MapMatch) -> Relocalization {
     let best = &rooms[0];
     let margin = rooms
         .get(1)
@@ -96,7 +88,7 @@ fn judged(rooms: Vec<RoomMatch>) -> Relocalization {
     // The margin is NaN when both distances are zero.
     let has_rival = margin.recip() > ROOM_RATIO || margin.is_nan();
     let is_far = best.out_of_distribution > 1.0;
-    let is_vague = !best.last.pose.tells_a_place();
+    let is_vague = !matched.pose.tells_a_place();
     let reason = if is_far {
         format!(
             "the distance to the best room is {:.2} times the room's limit",
@@ -105,7 +97,7 @@ fn judged(rooms: Vec<RoomMatch>) -> Relocalization {
     } else if has_rival {
         format!("the second-best room is only {margin:.2} times as far as the best")
     } else if is_vague {
-        let belief = &best.last.pose;
+        let belief = &matched.pose;
         format!(
             "the pose uncertainty in the best room is {:.2} m and {:.0}° (2.5 standard deviations)",
             2.5 * belief.position_deviation_m(),
@@ -117,6 +109,7 @@ fn judged(rooms: Vec<RoomMatch>) -> Relocalization {
 
     Relocalization {
         rooms,
+        best: matched,
         margin,
         ambiguous: has_rival || is_far || is_vague,
         reason,

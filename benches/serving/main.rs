@@ -3,6 +3,8 @@
 //! - `cargo bench --bench serving -- make FOLDER FRAMES` makes a store with a room and an adapter.
 //! - `cargo bench --bench serving -- run FOLDER SECONDS ROUNDS [NAME=ADDRESS]...` serves it, and prints what it
 //!   answers per second beside the empty service and beside other services of the same store.
+//! - `cargo bench --bench serving -- frames MOST HNSW_MOST`, `widths MOST`, `rooms FOLDER MOST FRAMES` and
+//!   `clients FOLDER MOST SECONDS` print how costs grow.
 //!
 //! Servers and clients run on the same machine, each with its own threads. A number is the median of the rounds,
 //! with the least and the largest; in each round the services take turns.
@@ -12,6 +14,8 @@
     clippy::expect_used,
     reason = "a failed step is a failed run here"
 )]
+
+mod growth;
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -23,16 +27,18 @@ use seese3_client::proto::v1::navigation_service_server::{
 };
 use seese3_core::adapter::Preset;
 use seese3_core::features::Features;
+use seese3_core::room::Room;
 use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
 use seese3_store::Store;
 use seese3_testing::wave_room::{COLUMNS, wave_room};
 use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
+use tokio::task::JoinHandle;
 use tonic::{Request, Response, Status};
 
 const STEPS: u32 = 4;
-/// Connections that share the requests in flight.
+/// Connections of a comparison.
 const CONNECTIONS: usize = 4;
 
 /// Answers every request with the same response.
@@ -82,8 +88,7 @@ async fn make(folder: &str, frame_count: usize) {
     let (adapter, record) = train_adapter(&data, &plan, &mut |_| ()).unwrap();
 
     let store = Store::create(folder).unwrap();
-    let sets = std::slice::from_ref(&features);
-    store.publish_room(&room, sets).await.unwrap();
+    published(&store, &room, &features).await;
     let rows = features.rows();
     store
         .publish_adapter("bench", &adapter, &record, rows)
@@ -91,13 +96,19 @@ async fn make(folder: &str, frame_count: usize) {
         .unwrap();
 }
 
-async fn serve(store: Store) -> String {
+async fn published(store: &Store, room: &Room, features: &Features) {
+    let sets = std::slice::from_ref(features);
+    store.publish_room(room, sets).await.unwrap();
+}
+
+/// The address of a server of the store, and its task.
+async fn serve(store: Store) -> (String, JoinHandle<()>) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap().to_string();
     let config = seese3_server::Config::default();
     let serving = seese3_server::run(listener, store, config, std::future::pending());
-    tokio::spawn(async { serving.await.unwrap() });
-    address
+    let task = tokio::spawn(async { serving.await.unwrap() });
+    (address, task)
 }
 
 async fn serve_empty(one: pb::NavigateResponse) -> String {
@@ -151,6 +162,8 @@ struct Load {
     in_flight: usize,
     /// Requests of a BatchNavigate; `None` for Navigate.
     batch: Option<usize>,
+    /// Connections that share the requests in flight.
+    connections: usize,
 }
 
 /// Answers per second and the median time of a call, microseconds.
@@ -160,7 +173,7 @@ async fn measured(
     load: Load,
     time: Duration,
 ) -> [f64; 2] {
-    let connections = CONNECTIONS.min(load.in_flight);
+    let connections = load.connections.min(load.in_flight);
     let mut clients = Vec::new();
     for _ in 0..connections {
         clients.push(
@@ -258,6 +271,12 @@ fn main() {
                 others,
             );
         }
+        ["frames", most, hnsw] => growth::frames(number(most), number(hnsw)),
+        ["widths", most] => growth::widths(number(most)),
+        ["rooms", folder, most, frames] => growth::rooms(folder, number(most), number(frames)),
+        ["clients", folder, most, seconds] => {
+            growth::clients(folder, number(most), seconds.parse().expect("seconds"));
+        }
         // `cargo bench` runs every benchmark.
         _ => {
             let folder = tempfile::tempdir().unwrap();
@@ -269,6 +288,10 @@ fn main() {
     }
 }
 
+fn number(word: &str) -> usize {
+    word.parse().expect("a number")
+}
+
 fn compare(folder: &str, time: Duration, rounds: usize, others: &[&str]) {
     let [served, empty, clients] = [(); 3].map(|()| Runtime::new().unwrap());
     let store = Store::open(folder).unwrap();
@@ -277,7 +300,7 @@ fn compare(folder: &str, time: Duration, rounds: usize, others: &[&str]) {
     let frame_count = features.rows().nrows();
     let requests = Arc::new(requests(features));
 
-    let address = served.block_on(serve(store));
+    let (address, _server) = served.block_on(serve(store));
     let one = clients.block_on(async {
         let client = Client::connect(&address, Duration::from_secs(60))
             .await
@@ -318,7 +341,11 @@ fn compare(folder: &str, time: Duration, rounds: usize, others: &[&str]) {
         ("batches of 64, 4 in flight", 4, Some(64)),
     ];
     for (name, in_flight, batch) in loads {
-        let load = Load { in_flight, batch };
+        let load = Load {
+            in_flight,
+            batch,
+            connections: CONNECTIONS,
+        };
         let mut rates: Vec<Rates> = services.iter().map(|_| Rates::default()).collect();
         for _ in 0..rounds {
             for ((_, address), found) in services.iter().zip(&mut rates) {
