@@ -31,3 +31,17 @@ done
 echo "10 nearest of 5,000 latents:"
 cargo bench --quiet --features full --bench hot_paths -- 'scan/exact/5000'
 "$peers/bin/python" benches/peers/nearest.py 5000
+
+echo "M1 to M3 of 5,000 x 768 features:"
+cargo bench --quiet --features full --bench hot_paths -- probes
+"$peers/bin/python" benches/peers/probes.py 5000 768
+
+echo "A training epoch:"
+cargo bench --quiet --features full --bench hot_paths -- epoch
+# PyTorch takes 6 GB: the one that exports encoders will do.
+torch="${SEESE3_TORCH:-${XDG_CACHE_HOME:-$HOME/.cache}/seese3/torch/bin/python}"
+if [ -x "$torch" ]; then
+    "$torch" benches/peers/training.py 768 256
+else
+    echo "SKIPPED PyTorch: set SEESE3_TORCH to a Python with torch"
+fi

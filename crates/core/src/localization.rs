@@ -28,11 +28,19 @@ pub fn localize<'a>(
     k: usize,
     cancel: &Cancellation,
 ) -> Result<Vec<Place>, Cancelled> {
-    let mut places = Vec::new();
+    let mut places: Vec<Place> = Vec::new();
     for navigator in rooms {
         cancel.check()?;
         let room = navigator.room().id();
-        places.extend(navigator.nearest(latent, k).into_iter().map(|frame| Place {
+        let mut found = navigator.nearest(latent, k);
+        if let Some(worst) = places.get(k.saturating_sub(1)) {
+            let limit = worst.frame.neighbor.distance;
+            found.retain(|frame| frame.neighbor.distance <= limit);
+        }
+        if found.is_empty() {
+            continue;
+        }
+        places.extend(found.into_iter().map(|frame| Place {
             room: room.clone(),
             frame,
         }));

@@ -2,7 +2,7 @@
 //! mean). The intercept is not penalized.
 
 use nalgebra::Cholesky;
-use ndarray::{Array1, Array2, ArrayView1, ArrayView2, Axis};
+use ndarray::{Array1, Array2, ArrayView1, ArrayView2, Axis, s};
 
 use crate::matrices::{to_nalgebra, to_ndarray};
 
@@ -79,9 +79,9 @@ impl Ridge {
 
         // (XᵀX + αI)⁻¹XᵀY = Xᵀ(XXᵀ + αI)⁻¹Y: solve the smaller system.
         let coefficients = if x.nrows() < x.ncols() {
-            solved(x.dot(&x.t()), alpha, &y)?.reversed_axes().dot(&x)
+            solved(gram(x.t()), alpha, &y)?.reversed_axes().dot(&x)
         } else {
-            solved(x.t().dot(&x), alpha, &x.t().dot(&y))?.reversed_axes()
+            solved(gram(x.view()), alpha, &x.t().dot(&y))?.reversed_axes()
         };
         let intercept = target_mean - coefficients.dot(&input_mean);
 
@@ -95,6 +95,26 @@ impl Ridge {
     pub fn predict(&self, input: ArrayView1<'_, f64>) -> Array1<f64> {
         self.coefficients.dot(&input) + &self.intercept
     }
+}
+
+/// Columns of a block of [`gram`].
+const GRAM_BLOCK: usize = 128;
+
+/// XᵀX. Of two blocks that are mirrored, one is computed.
+fn gram(x: ArrayView2<'_, f64>) -> Array2<f64> {
+    let mut gram = Array2::zeros((x.ncols(), x.ncols()));
+    let blocks = (0..x.ncols()).step_by(GRAM_BLOCK);
+    for start in blocks {
+        let end = (start + GRAM_BLOCK).min(x.ncols());
+        let part = x
+            .slice(s![.., start..end])
+            .t()
+            .dot(&x.slice(s![.., start..]));
+        gram.slice_mut(s![start..end, start..]).assign(&part);
+        gram.slice_mut(s![start.., start..end]).assign(&part.t());
+    }
+
+    gram
 }
 
 /// (G + αI)⁻¹R for a symmetric G.
@@ -145,7 +165,7 @@ mod tests {
     /// − αB is zero, with more inputs than rows as with fewer.
     #[test]
     fn the_gradient_is_zero_however_wide_the_inputs() {
-        for (rows, columns) in [(7, 30), (30, 7), (8, 8)] {
+        for (rows, columns) in [(7, 30), (30, 7), (8, 8), (150, 300), (300, 150)] {
             let wave =
                 |i: usize, j: usize| ((3 * i + 7 * j) as f64 * 0.37).sin() + 0.1 * (i * j) as f64;
             let x = Array2::from_shape_fn((rows, columns), |(i, j)| wave(i, j));

@@ -158,12 +158,11 @@ fn answer(
         None => pb::LocalizeResponse::default(),
     };
 
-    let served = retrieved.iter().flat_map(|retrieved| &retrieved.served);
-    let searched = served.map(|served| served.navigator.room().id());
-    let searched: BTreeSet<&RoomId> = searched.chain(matches.rooms()).collect();
-    response.room_count = searched.len() as u32;
-    let mut served = retrieved.iter().flat_map(|retrieved| &retrieved.served);
-    response.exact = served.all(|served| served.navigator.audit().is_none());
+    let served = || retrieved.iter().flat_map(|retrieved| &retrieved.served);
+    let matched: BTreeSet<&RoomId> = matches.rooms().collect();
+    let also_matched = served().filter(|served| matched.contains(served.navigator.room().id()));
+    response.room_count = (served().count() + matched.len() - also_matched.count()) as u32;
+    response.exact = served().all(|served| served.navigator.audit().is_none());
 
     fill_pose(&mut response, matches, retrieved.as_ref())?;
     if response.method() != pb::LocalizationMethod::MatchedKeypoints
@@ -594,15 +593,17 @@ pub(super) fn rooms_under(
 
     // In a search of all rooms, skip damaged rooms, like those refused at loading. The log and the
     // rooms' health report them.
-    let fitting = snapshot
-        .rooms()
-        .iter()
-        .filter(|(_, room)| room.is_served_by(&adapter));
-    let answers = |answer: &Result<_, Error>| !matches!(answer, Err(Error::Precondition(_)));
-    let served: Vec<_> = fitting
-        .map(|(name, _)| snapshot.navigator(name, &adapter))
-        .filter(answers)
-        .collect::<Result<_, _>>()?;
+    let mut served = Vec::new();
+    for room in snapshot.rooms().values() {
+        if !room.is_served_by(&adapter) {
+            continue;
+        }
+        match room.load() {
+            Ok(loaded) => served.extend(loaded.under_any(&adapter).cloned()),
+            Err(Error::Precondition(_)) => {}
+            Err(error) => return Err(error),
+        }
+    }
 
     if served.is_empty() {
         return Err(Error::Precondition(format!(

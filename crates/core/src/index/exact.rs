@@ -73,7 +73,8 @@ impl ExactIndex {
                 excluded: excluded.clone(),
                 nearest: Nearest::new(k),
             };
-            search.found(bounds.iter().map(|bounds| bounds[which]))
+            let bounds: Vec<f32> = bounds.iter().map(|bounds| bounds[which]).collect();
+            search.found(&bounds)
         })
     }
 
@@ -115,36 +116,27 @@ struct Search<'a> {
 
 impl Search<'_> {
     /// The nearest rows, given the least lower bound of each block's scores.
-    fn found(mut self, bounds: impl Iterator<Item = f32>) -> Vec<Neighbor> {
-        let mut blocks: Vec<(f32, usize)> = bounds.zip(0..).collect();
+    fn found(mut self, bounds: &[f32]) -> Vec<Neighbor> {
         if !self.scored.has_scores() {
-            (0..blocks.len()).for_each(|block| self.look_at(block));
+            (0..bounds.len()).for_each(|block| self.look_at(block));
             return self.nearest.found();
         }
 
-        // Blocks that have enough rows for an answer, unless a lower bound was far too low.
+        // The likeliest blocks, with enough rows for an answer; they tell how near the others have to be.
         let wanted = self.nearest.count().saturating_add(self.excluded.len());
-        let first = (wanted.div_ceil(LANES) + 1).min(blocks.len());
-        if first < blocks.len() {
-            blocks.select_nth_unstable_by(first, |a, b| a.0.total_cmp(&b.0));
-        }
-        let (first, rest) = blocks.split_at_mut(first);
-        self.look_at_each(first);
-
+        let least = nth_least(bounds, wanted.div_ceil(LANES));
+        self.look_at_each(bounds, |bound| bound <= least);
         let limit = self.limit();
-        let mut near: Vec<(f32, usize)> = rest
-            .iter()
-            .copied()
-            .filter(|&(bound, _)| bound <= limit)
-            .collect();
-        self.look_at_each(&mut near);
+        self.look_at_each(bounds, |bound| bound > least && bound <= limit);
         self.nearest.found()
     }
 
-    /// Looks at blocks, the likeliest first, as long as they can hold an answer.
-    fn look_at_each(&mut self, blocks: &mut [(f32, usize)]) {
+    /// Looks at some blocks, the likeliest first, as long as they can hold an answer.
+    fn look_at_each(&mut self, bounds: &[f32], is_among: impl Fn(f32) -> bool) {
+        let blocks = bounds.iter().copied().zip(0..);
+        let mut blocks: Vec<(f32, usize)> = blocks.filter(|&(bound, _)| is_among(bound)).collect();
         blocks.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
-        for &(bound, block) in &*blocks {
+        for (bound, block) in blocks {
             if bound > self.limit() {
                 break;
             }
@@ -171,6 +163,17 @@ impl Search<'_> {
         let worst = self.nearest.worst();
         worst.map_or(f32::INFINITY, |worst| self.scored.score_at(worst))
     }
+}
+
+/// The `n`-th least of some numbers; the largest if there are fewer.
+fn nth_least(numbers: &[f32], n: usize) -> f32 {
+    if n <= 1 || numbers.is_empty() {
+        return numbers.iter().copied().fold(f32::INFINITY, f32::min);
+    }
+
+    let mut numbers = numbers.to_vec();
+    let place = n.min(numbers.len()) - 1;
+    *numbers.select_nth_unstable_by(place, f32::total_cmp).1
 }
 
 impl Index for ExactIndex {

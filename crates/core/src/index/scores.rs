@@ -14,6 +14,9 @@ pub const LANES: usize = 16;
 const DIRECTIONS: usize = 7;
 /// The coordinates along the directions and the length of the rest.
 const BOUND_COLUMNS: usize = DIRECTIONS + 1;
+/// Blocks whose bounds are computed before the least of each is taken: in one loop, the compiler would not use
+/// whole registers.
+const BLOCKS_AT_A_TIME: usize = 16;
 /// Rows that the directions are chosen by.
 const CHOOSING_ROWS: usize = 1_024;
 /// Steps of the subspace iteration that chooses them.
@@ -199,21 +202,25 @@ fn directions(rows: &[f64], width: usize) -> Array2<f64> {
     let finite = rows.iter().all(|x| x.is_finite());
     let usable = finite && !rows.is_empty();
     let Some(rows) = ArrayView2::from_shape(shape, rows).ok().filter(|_| usable) else {
-        return unit.reversed_axes();
+        return unit.t().as_standard_layout().into_owned();
     };
 
     let step = |directions: Array2<f64>, _| {
         let scattered = rows.t().dot(&rows.dot(&directions));
         to_ndarray(&to_nalgebra(scattered.view()).qr().q())
     };
-    (0..ITERATIONS).fold(unit, step).reversed_axes()
+    let found = (0..ITERATIONS).fold(unit, step);
+    found.t().as_standard_layout().into_owned()
 }
 
 /// Coordinates along the directions, zeros for those that there are not, and the length of the rest.
 fn of_bound(directions: &Array2<f64>, mut row: Vec<f64>) -> [f64; BOUND_COLUMNS] {
     let mut found = [0.0; BOUND_COLUMNS];
-    for (direction, found) in directions.outer_iter().zip(&mut found) {
-        let along = direction.iter().zip(&row).map(|(d, x)| d * x).sum::<f64>();
+    let directions = directions.as_slice().unwrap_or_default();
+    let directions = directions.chunks_exact(row.len().max(1));
+    for (direction, found) in directions.zip(&mut found) {
+        let products = direction.iter().zip(&row).map(|(d, x)| d * x);
+        let along = products.sum::<f64>();
         for (x, d) in row.iter_mut().zip(direction) {
             *x -= along * d;
         }
@@ -233,37 +240,47 @@ fn least_bounds<const QUERIES: usize>(
     negated: &[[f32; QUERIES]; BOUND_COLUMNS],
 ) -> Vec<[f32; QUERIES]> {
     let mut least = vec![[0.0; QUERIES]; half_squares.len()];
-    for ((block, half_squares), least) in columns.iter().zip(half_squares).zip(&mut least) {
-        // A copy on the stack stays in registers.
-        let mut sums = [*half_squares; QUERIES];
-        for column in 0..BOUND_COLUMNS {
-            for query in 0..QUERIES {
-                for lane in 0..LANES {
-                    sums[query][lane] += block[column][lane] * negated[column][query];
+    let blocks = columns
+        .chunks(BLOCKS_AT_A_TIME)
+        .zip(half_squares.chunks(BLOCKS_AT_A_TIME));
+    for ((blocks, half_squares), least) in blocks.zip(least.chunks_mut(BLOCKS_AT_A_TIME)) {
+        let mut bounds = [[[0.0; LANES]; QUERIES]; BLOCKS_AT_A_TIME];
+        for ((block, half_squares), bounds) in blocks.iter().zip(half_squares).zip(&mut bounds) {
+            // A copy on the stack stays in registers.
+            let mut sums = [*half_squares; QUERIES];
+            for column in 0..BOUND_COLUMNS {
+                for query in 0..QUERIES {
+                    for lane in 0..LANES {
+                        sums[query][lane] += block[column][lane] * negated[column][query];
+                    }
                 }
             }
+            *bounds = sums;
         }
 
-        for query in 0..QUERIES {
-            let bounds = &mut sums[query];
-            let mut half = LANES / 2;
-            while half > 0 {
-                for lane in 0..half {
-                    let other = bounds[lane + half];
-                    // Not f32::min, which takes more instructions because of NaN.
-                    bounds[lane] = if other < bounds[lane] {
-                        other
-                    } else {
-                        bounds[lane]
-                    };
-                }
-                half /= 2;
+        for (least, bounds) in least.iter_mut().zip(&mut bounds) {
+            for query in 0..QUERIES {
+                least[query] = least_of(&mut bounds[query]);
             }
-            least[query] = bounds[0];
         }
     }
 
     least
+}
+
+/// The least of a block's numbers.
+#[inline(always)]
+fn least_of(numbers: &mut [f32; LANES]) -> f32 {
+    let mut half = LANES / 2;
+    while half > 0 {
+        for lane in 0..half {
+            let [a, b] = [numbers[lane], numbers[lane + half]];
+            // Not f32::min, which takes more instructions because of NaN.
+            numbers[lane] = if b < a { b } else { a };
+        }
+        half /= 2;
+    }
+    numbers[0]
 }
 
 /// The scores of a block, by the widest instructions of this processor.

@@ -88,8 +88,11 @@ pub fn intrinsic_dimension(
     }
 
     let points = all.select(Axis(0), &kept);
-    let apart = |row: usize, other: usize| kept[other].abs_diff(kept[row]) > gap;
-    let found = nearest_rows(points.view(), MLE_NEIGHBORS, apart);
+    let near = |row: usize| {
+        let first = kept.partition_point(|&other| other < kept[row].saturating_sub(gap));
+        first..kept.partition_point(|&other| other <= kept[row].saturating_add(gap))
+    };
+    let found = nearest_rows(points.view(), MLE_NEIGHBORS, near);
     let found = found.map_err(|TooFewCandidates { row }| Error::TooFewCandidates {
         frame: kept[row],
         k: MLE_NEIGHBORS,

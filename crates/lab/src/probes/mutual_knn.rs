@@ -214,8 +214,16 @@ fn sampled(have: usize, options: &MutualKnn) -> Result<Vec<usize>, Error> {
 
 /// The k nearest rows of each row.
 fn nearest(rows: ArrayView2<'_, f64>, options: &MutualKnn) -> Result<Vec<Vec<usize>>, Error> {
-    let apart = |frame: usize, other: usize| options.apart(frame, other);
-    let found = nearest_rows(rows, options.k, apart);
+    // The frames that are not apart from a frame are around it.
+    let apart_from = |frame: usize, reach: usize| options.apart(frame, frame + reach);
+    let reach = (0..options.frames)
+        .take_while(|&reach| !apart_from(0, reach))
+        .count();
+    let near = |frame: usize| {
+        let first = (frame + 1).saturating_sub(reach);
+        first..(frame + reach).min(options.frames)
+    };
+    let found = nearest_rows(rows, options.k, near);
     let found = found.map_err(|TooFewCandidates { row }| options.too_few_candidates(row))?;
     let frames_of = |found: Vec<(f64, usize)>| found.into_iter().map(|(_, frame)| frame).collect();
     Ok(found.into_iter().map(frames_of).collect())

@@ -4,12 +4,16 @@
 //! nearest, in spite of the error of f32, are compared in f64: the expansion ‖x‖² − 2xy + ‖y‖² would cancel for
 //! near duplicates. So the answer is that of comparing all pairs in f64.
 
-use ndarray::{Array2, ArrayView2, Axis};
+use std::ops::Range;
+
+use ndarray::{Array2, ArrayView1, ArrayView2, Axis, s};
 use rayon::prelude::*;
 use seese3_core::index::distance;
 
 /// Rows whose products with all rows are computed together.
-const ROWS_AT_A_TIME: usize = 64;
+const ROWS_AT_A_TIME: usize = 256;
+/// Least number of parts of the rows whose least scores bound the k-th least score.
+const PARTS: usize = 64;
 
 /// A row that has too few candidates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -18,27 +22,24 @@ pub struct TooFewCandidates {
     pub row: usize,
 }
 
-/// The `k` nearest rows of each row with their distances, nearest first; ties go to the smaller row. Row `other`
-/// is a candidate of row `row` if `may_be(row, other)`.
+/// The `k` nearest rows of each row with their distances, nearest first; ties go to the smaller row. `excluded`
+/// gives the rows that are no candidates of a row.
 ///
 /// # Errors
 /// [`TooFewCandidates`] for the first row with fewer than `k`.
 pub fn nearest_rows(
     rows: ArrayView2<'_, f64>,
     k: usize,
-    may_be: impl Fn(usize, usize) -> bool + Sync,
+    excluded: impl Fn(usize) -> Range<usize> + Sync,
 ) -> Result<Vec<Vec<(f64, usize)>>, TooFewCandidates> {
     let scores = Scores::new(rows);
     let starts: Vec<usize> = (0..rows.nrows()).step_by(ROWS_AT_A_TIME).collect();
     let rows = rows.as_standard_layout();
     let of_chunk = |&start: &usize| -> Result<Vec<Vec<(f64, usize)>>, TooFewCandidates> {
         let products = scores.products(start);
-        let of_row = |(products, row): (ndarray::ArrayView1<'_, f32>, usize)| {
-            let others = (0..rows.nrows()).filter(|&other| may_be(row, other));
-            let scored: Vec<(f32, usize)> = others
-                .map(|other| (scores.half_squares[other] - products[other], other))
-                .collect();
-            let near = scores.near(scored, k).ok_or(TooFewCandidates { row })?;
+        let of_row = |(products, row): (ArrayView1<'_, f32>, usize)| {
+            let near = scores.near(products, excluded(row), k);
+            let near = near.ok_or(TooFewCandidates { row })?;
 
             let slice = |row: usize| rows.row(row).to_slice();
             let exact = |other: usize| Some((distance(slice(row)?, slice(other)?), other));
@@ -68,13 +69,13 @@ impl Scores {
         if let Some(mean) = rows.mean_axis(Axis(0)) {
             centered -= &mean;
         }
-        let norm = |row: ndarray::ArrayView1<'_, f64>| row.dot(&row).sqrt();
+        let norm = |row: ArrayView1<'_, f64>| row.dot(&row).sqrt();
         let largest = centered.outer_iter().map(norm).fold(0.0, f64::max);
         if largest > 0.0 {
             centered /= largest;
         }
 
-        let half_square = |row: ndarray::ArrayView1<'_, f64>| (0.5 * row.dot(&row)) as f32;
+        let half_square = |row: ArrayView1<'_, f64>| (0.5 * row.dot(&row)) as f32;
         Self {
             half_squares: centered.outer_iter().map(half_square).collect(),
             rows: centered.mapv(|x| x as f32),
@@ -84,28 +85,47 @@ impl Scores {
     /// The products of [`ROWS_AT_A_TIME`] rows, from `start` on, with all rows.
     fn products(&self, start: usize) -> Array2<f32> {
         let end = (start + ROWS_AT_A_TIME).min(self.rows.nrows());
-        let some = self.rows.slice(ndarray::s![start..end, ..]);
-        some.dot(&self.rows.t())
+        self.rows.slice(s![start..end, ..]).dot(&self.rows.t())
     }
 
-    /// The rows that can be among the `k` nearest; `None` if there are fewer than `k`.
-    fn near(&self, mut scored: Vec<(f32, usize)>, k: usize) -> Option<Vec<usize>> {
-        let last = k.checked_sub(1).filter(|&last| last < scored.len())?;
-        let (_, &mut (kth, _), _) = scored.select_nth_unstable_by(last, |a, b| a.0.total_cmp(&b.0));
+    /// Rows that include the `k` nearest; `None` if there are fewer candidates than `k`.
+    fn near(
+        &self,
+        products: ArrayView1<'_, f32>,
+        excluded: Range<usize>,
+        k: usize,
+    ) -> Option<Vec<usize>> {
+        let rows = 0..self.half_squares.len();
+        if rows.len() - excluded.len() < k {
+            return None;
+        }
+        let scores = self.half_squares.iter().zip(products);
+        let mut scores: Vec<f32> = scores.map(|(half, product)| half - product).collect();
+        scores[excluded.clone()].fill(f32::INFINITY);
 
         // A score of w columns is a sum of w + 1 terms, which are at most 1 together; operands and partial sums
         // are rounded. Both scores of a comparison may be wrong.
         let roundings = 2.0 * (self.rows.ncols() + 2) as f32;
-        let limit = kth + 2.0 * roundings * f32::EPSILON;
-        let is_near = |&(score, _): &(f32, usize)| score.is_nan() || score <= limit;
-        Some(
-            scored
-                .into_iter()
-                .filter(is_near)
-                .map(|(_, row)| row)
-                .collect(),
-        )
+        let limit = kth_at_most(&scores, k) + 2.0 * roundings * f32::EPSILON;
+        let is_near = |&row: &usize| scores[row] <= limit || !scores[row].is_finite();
+        let is_candidate = |row: &usize| !excluded.contains(row);
+        Some(rows.filter(is_near).filter(is_candidate).collect())
     }
+}
+
+/// An upper bound of the `k`-th least number: at least `k` numbers are at most the `k`-th of the least ones of
+/// parts. Neighboring numbers are in different parts, because neighboring rows are alike.
+fn kth_at_most(numbers: &[f32], k: usize) -> f32 {
+    let parts = PARTS.max(4 * k);
+    let mut least = vec![f32::INFINITY; parts];
+    for numbers in numbers.chunks(parts) {
+        for (least, &number) in least.iter_mut().zip(numbers) {
+            *least = if number < *least { number } else { *least };
+        }
+    }
+
+    let place = k.saturating_sub(1);
+    *least.select_nth_unstable_by(place, f32::total_cmp).1
 }
 
 #[cfg(test)]
@@ -125,16 +145,16 @@ mod tests {
             let place =
                 |row: usize, column: usize| ((row / 5 * 7 + column * 3) as f64 * 0.61).sin();
             let shake = |row: usize, column: usize| ((row * 13 + column) as f64).cos();
-            let rows = Array2::from_shape_fn((150, columns), |(row, column)| {
+            let rows = Array2::from_shape_fn((300, columns), |(row, column)| {
                 scale * (offset + place(row, column) + noise * shake(row, column))
             });
-            let apart = |row: usize, other: usize| row.abs_diff(other) > 2;
+            let excluded = |row: usize| row.saturating_sub(2)..(row + 3).min(300);
 
-            let found = nearest_rows(rows.view(), 7, apart).unwrap();
+            let found = nearest_rows(rows.view(), 7, excluded).unwrap();
             for (row, found) in found.iter().enumerate() {
                 let far =
                     |other: usize| distance(&rows.row(row).to_vec(), &rows.row(other).to_vec());
-                let others = (0..150).filter(|&other| apart(row, other));
+                let others = (0..300).filter(|&other| row.abs_diff(other) > 2);
                 let mut expected: Vec<(f64, usize)> =
                     others.map(|other| (far(other), other)).collect();
                 expected.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
@@ -143,14 +163,14 @@ mod tests {
         }
     }
 
-    /// Oracle: by hand: of six rows, row 2 may have rows 0 and 5 as neighbors.
+    /// Oracle: by hand: of six rows, row 2 may have rows 0 and 5 as neighbors, the others all but themselves.
     #[test]
     fn a_row_with_too_few_candidates_is_named() {
         let rows = Array2::from_shape_fn((6, 1), |(row, _)| row as f64);
-        let apart = |row: usize, other: usize| row.abs_diff(other) > 1;
-        assert!(nearest_rows(rows.view(), 3, apart).is_ok());
-        let apart = |row: usize, other: usize| row != 2 && row != other || other == 0 || other == 5;
-        let found = nearest_rows(rows.view(), 3, apart);
+        let excluded = |row: usize| if row == 2 { 1..5 } else { row..row + 1 };
+        let found = nearest_rows(rows.view(), 2, excluded).unwrap();
+        assert_eq!(found[2], [(2.0, 0), (3.0, 5)]);
+        let found = nearest_rows(rows.view(), 3, excluded);
         assert_eq!(found, Err(TooFewCandidates { row: 2 }));
     }
 }
