@@ -2,8 +2,8 @@
 
     python probes.py [ROWS] [COLUMNS]
 
-The data of `cargo bench --bench probes`: a smooth path bent into many columns, with noise. M1: cosine neighbours among features
-and Euclidean ones among nine numbers, k = 10, without 10 frames to each side. M2: TwoNN and MLE over 20 neighbours. M3: ridge
+The data of `cargo bench --bench hot_paths -- probes`: a smooth path bent into many columns, with noise. M1: cosine neighbors among features
+and Euclidean ones among nine numbers, k = 10, without 10 frames to each side. M2: TwoNN and MLE over 20 neighbors. M3: ridge
 regression from differences at stride 10. All threads. Prints the median of three runs in milliseconds. Needs numpy, scikit-learn
 and scikit-dimension.
 """
@@ -27,13 +27,13 @@ def bent_path(rows, columns):
 
 
 def mutual(features, poses):
-    def neighbours(rows, metric):
+    def neighbors(rows, metric):
         wanted = K + 2 * GAP + 1
         found = NearestNeighbors(n_neighbors=wanted, metric=metric).fit(rows).kneighbors(rows, return_distance=False)
         for row, frames in enumerate(found):
             yield {*frames[np.abs(frames - row) > GAP][:K]}
 
-    pairs = zip(neighbours(features, "cosine"), neighbours(poses, "euclidean"))
+    pairs = zip(neighbors(features, "cosine"), neighbors(poses, "euclidean"))
     return np.mean([len(a & b) / K for a, b in pairs])
 
 

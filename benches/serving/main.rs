@@ -355,19 +355,19 @@ fn compare(folder: &str, time: Duration, rounds: usize, others: &[&str]) {
             }
         }
 
-        for ((service, _), found) in services.iter().zip(&rates) {
-            let of_empty = found.per_second.iter().zip(&rates[1].per_second);
-            println!(
-                "{name} | {service} | {} | {} | {}",
-                spread(&found.per_second, 0),
-                spread(
-                    &of_empty
-                        .map(|(one, empty)| one / empty)
-                        .collect::<Vec<f64>>(),
-                    3
-                ),
-                spread(&found.p50_us, 0),
-            );
-        }
+        print_rates(name, &services, &rates);
+    }
+}
+
+fn print_rates(load: &str, services: &[(&str, &str)], rates: &[Rates]) {
+    for ((service, _), found) in services.iter().zip(rates) {
+        let of_empty = found.per_second.iter().zip(&rates[1].per_second);
+        let of_empty: Vec<f64> = of_empty.map(|(one, empty)| one / empty).collect();
+        println!(
+            "{load} | {service} | {} | {} | {}",
+            spread(&found.per_second, 0),
+            spread(&of_empty, 3),
+            spread(&found.p50_us, 0),
+        );
     }
 }

@@ -166,8 +166,9 @@ mod tests {
     #[test]
     fn the_gradient_is_zero_however_wide_the_inputs() {
         for (rows, columns) in [(7, 30), (30, 7), (8, 8), (150, 300), (300, 150)] {
-            let wave =
-                |i: usize, j: usize| ((3 * i + 7 * j) as f64 * 0.37).sin() + 0.1 * (i * j) as f64;
+            let wave = |i: usize, j: usize| {
+                ((3 * i + 7 * j) as f64 * 0.37).sin() + 0.1 * (i * j % 7) as f64
+            };
             let x = Array2::from_shape_fn((rows, columns), |(i, j)| wave(i, j));
             let y = Array2::from_shape_fn((rows, 2), |(i, t)| wave(t + 5, i));
             let fit = Ridge::fit(x.view(), y.view(), 0.5, Intercept::Fitted).unwrap();
