@@ -1,10 +1,11 @@
-"""M1 to M3 as a researcher would call them: scikit-learn and scikit-dimension.
+"""M1 to M3 by scikit-learn and scikit-dimension.
 
-    python probes.py [ROWS] [COLUMNS]
+    python probes.py [ROWS COLUMNS]
 
 The data of `cargo bench --bench hot_paths -- probes`: a smooth path bent into many columns, with noise. M1: cosine neighbors among features
 and Euclidean ones among nine numbers, k = 10, without 10 frames to each side. M2: TwoNN and MLE over 20 neighbors. M3: ridge
-regression from differences at stride 10. All threads. Prints the median of three runs in milliseconds. Needs numpy, scikit-learn
+regression from differences at stride 10. The libraries choose their
+threads. Prints the median of three runs in milliseconds. Needs numpy, scikit-learn
 and scikit-dimension.
 """
 

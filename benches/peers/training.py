@@ -1,4 +1,4 @@
-"""A training epoch of the adapter as one would write it in PyTorch.
+"""A training epoch of the adapter in plain PyTorch.
 
     python training.py [WIDTH ...]
 

@@ -187,11 +187,11 @@ pub fn rooms(folder: &str, most: usize, frames: usize) {
     let mut before: [Option<(f64, f64)>; 2] = [None; 2];
     let mut made = 0;
     for count in sizes(1, most) {
-        let began = Instant::now();
         if made == 0 {
             clients.block_on(make(folder, frames));
             made = 1;
         }
+        let began = Instant::now();
         let store = Store::open(folder).unwrap();
         for room in made..count {
             let (room, features) = wave_room(&format!("room-{room}"), room as u64 + 2, frames);
@@ -205,7 +205,7 @@ pub fn rooms(folder: &str, most: usize, frames: usize) {
         let (address, server) = served.block_on(serve(store));
         let client = clients.block_on(ready(&address));
         let start = began.elapsed().as_secs_f64();
-        let memory = (resident() - memory) as f64 / 1024.0 / count as f64;
+        let memory = resident().saturating_sub(memory) as f64 / 1e3 / count as f64;
 
         let (_, features) = wave_room("bench", 1, frames);
         let requests = requests(&features);
@@ -236,7 +236,7 @@ pub fn rooms(folder: &str, most: usize, frames: usize) {
     }
 }
 
-/// A server by requests in flight, each by a client of its own.
+/// A server by requests in flight, each on a connection of its own.
 pub fn clients(folder: &str, most: usize, seconds: f64) {
     let served = Runtime::new().unwrap();
     let clients = Runtime::new().unwrap();

@@ -106,7 +106,7 @@ pub(super) fn wide_dot_products(matrix: &[f32], vector: &[f32]) -> Vec<f64> {
         for (row, vector) in row_lanes.iter().zip(vector_lanes) {
             for lane in 0..LANES {
                 let x = f64::from(row[lane]);
-                // Without the instruction, it would be a call.
+                // Without the instruction, mul_add would be a slow call.
                 sums[lane] = if target_cfg_f!(target_feature = "fma") {
                     x.mul_add(vector[lane], sums[lane])
                 } else {

@@ -1,5 +1,4 @@
-//! Exact search: the reference for other indexes, and the fastest in the largest rooms measured, 20,000
-//! frames.
+//! Exact search: the reference for other indexes.
 
 use std::ops::Range;
 
@@ -118,21 +117,21 @@ impl Search<'_> {
     /// The nearest rows, given the least lower bound of each block's scores.
     fn found(mut self, bounds: &[f32]) -> Vec<Neighbor> {
         if !self.scored.has_scores() {
-            (0..bounds.len()).for_each(|block| self.look_at(block));
+            (0..bounds.len()).for_each(|block| self.search_block(block));
             return self.nearest.found();
         }
 
-        // The likeliest blocks, with enough rows for an answer; they tell how near the others have to be.
+        // First the most promising blocks, with enough rows for an answer. They give the limit for the others.
         let wanted = self.nearest.count().saturating_add(self.excluded.len());
         let least = nth_least(bounds, wanted.div_ceil(LANES));
-        self.look_at_each(bounds, |bound| bound <= least);
+        self.search_each(bounds, |bound| bound <= least);
         let limit = self.limit();
-        self.look_at_each(bounds, |bound| bound > least && bound <= limit);
+        self.search_each(bounds, |bound| bound > least && bound <= limit);
         self.nearest.found()
     }
 
-    /// Looks at some blocks, the likeliest first, as long as they can hold an answer.
-    fn look_at_each(&mut self, bounds: &[f32], is_among: impl Fn(f32) -> bool) {
+    /// Searches some blocks, the most promising first, as long as they can hold an answer.
+    fn search_each(&mut self, bounds: &[f32], is_among: impl Fn(f32) -> bool) {
         let blocks = bounds.iter().copied().zip(0..);
         let mut blocks: Vec<(f32, usize)> = blocks.filter(|&(bound, _)| is_among(bound)).collect();
         blocks.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
@@ -140,14 +139,21 @@ impl Search<'_> {
             if bound > self.limit() {
                 break;
             }
-            self.look_at(block);
+            self.search_block(block);
         }
     }
 
-    /// Offers the rows of a block that can be answers.
-    fn look_at(&mut self, block: usize) {
+    /// Compares the rows of a block that can be answers.
+    fn search_block(&mut self, block: usize) {
         let limit = self.limit();
         let scores = self.index.rows.scores(block, self.scored);
+        // Without branches, so that the rows are compared together.
+        let is_any_near = scores
+            .iter()
+            .fold(false, |any, &score| any | (score <= limit));
+        if !is_any_near && self.scored.has_scores() {
+            return;
+        }
         let positions = block * LANES..self.index.frames.len().min((block + 1) * LANES);
         for (position, score) in positions.zip(scores) {
             let can_be_near = score <= limit || !self.scored.has_scores();

@@ -9,15 +9,15 @@ use crate::matrices::{to_nalgebra, to_ndarray};
 /// Rows of a block: they are compared together, by SIMD instructions where there are any.
 pub const LANES: usize = 16;
 
-/// Directions whose coordinates a lower bound reads. Motions have six dimensions, and so, nearly, have the
-/// latents of an adapter.
+/// Directions whose coordinates a lower bound reads. Latents of an adapter vary in about six directions, as motions
+/// do.
 const DIRECTIONS: usize = 7;
 /// The coordinates along the directions and the length of the rest.
 const BOUND_COLUMNS: usize = DIRECTIONS + 1;
 /// Blocks whose bounds are computed before the least of each is taken: in one loop, the compiler would not use
 /// whole registers.
 const BLOCKS_AT_A_TIME: usize = 16;
-/// Rows that the directions are chosen by.
+/// Approximate number of rows that the directions are chosen by.
 const CHOOSING_ROWS: usize = 1_024;
 /// Steps of the subspace iteration that chooses them.
 const ITERATIONS: usize = 4;
@@ -25,7 +25,7 @@ const ITERATIONS: usize = 4;
 /// Half of the distance between 1 and the next number.
 const ROUNDING: [f64; 2] = [f32::EPSILON as f64 / 2.0, f64::EPSILON / 2.0];
 
-/// The most that a sum of squares may be: above it, f32 could overflow.
+/// The largest sum of squares that is computed in f32: above it, f32 could overflow.
 const LARGEST_SQUARE: f64 = 1e37;
 
 /// Rows that are ordered by score: ‖x‖²/2 − x·q for row x and query q. As ‖x − q‖²/2 is the score plus
@@ -67,7 +67,7 @@ pub struct ScoredQuery {
 }
 
 impl ScoredQuery {
-    /// Whether scores say anything about this query.
+    /// Whether scores in f32 can be used for this query.
     pub fn has_scores(&self) -> bool {
         self.error.is_finite()
     }
@@ -197,7 +197,18 @@ fn norm<'a>(row: impl IntoIterator<Item = &'a f64>) -> f64 {
 /// [`DIRECTIONS`], k), by subspace iteration. Bounds hold for any orthonormal directions.
 fn directions(rows: &[f64], width: usize) -> Array2<f64> {
     let count = DIRECTIONS.min(width);
-    let unit = Array2::from_shape_fn((width, count), |(row, column)| f64::from(row == column));
+    // The columns of the largest squares come first: the iteration needs a start that is not constant.
+    let mut squares = vec![0.0; width];
+    for row in rows.chunks_exact(width.max(1)) {
+        for (sum, x) in squares.iter_mut().zip(row) {
+            *sum += x * x;
+        }
+    }
+    let mut columns: Vec<usize> = (0..width).collect();
+    columns.sort_by(|&a, &b| f64::total_cmp(&squares[b], &squares[a]));
+    let unit = Array2::from_shape_fn((width, count), |(row, column)| {
+        f64::from(row == columns[column])
+    });
     let shape = (rows.len() / width.max(1), width);
     let finite = rows.iter().all(|x| x.is_finite());
     let usable = finite && !rows.is_empty();
@@ -213,7 +224,7 @@ fn directions(rows: &[f64], width: usize) -> Array2<f64> {
     found.t().as_standard_layout().into_owned()
 }
 
-/// Coordinates along the directions, zeros for those that there are not, and the length of the rest.
+/// Coordinates along the directions, padded with zeros, and the length of the rest.
 fn of_bound(directions: &Array2<f64>, mut row: Vec<f64>) -> [f64; BOUND_COLUMNS] {
     let mut found = [0.0; BOUND_COLUMNS];
     let directions = directions.as_slice().unwrap_or_default();

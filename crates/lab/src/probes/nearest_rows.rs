@@ -23,7 +23,7 @@ pub struct TooFewCandidates {
 }
 
 /// The `k` nearest rows of each row with their distances, nearest first; ties go to the smaller row. `excluded`
-/// gives the rows that are no candidates of a row.
+/// gives the rows that are no candidates of a row; it has to contain the row itself, and end within the rows.
 ///
 /// # Errors
 /// [`TooFewCandidates`] for the first row with fewer than `k`.
