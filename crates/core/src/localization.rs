@@ -32,6 +32,7 @@ pub fn localize<'a>(
     for navigator in rooms {
         cancel.check()?;
         let room = navigator.room().id();
+        // Most of many rooms have no frame that is near enough: they need no sorting.
         let mut found = navigator.nearest(latent, k);
         if let Some(worst) = places.get(k.saturating_sub(1)) {
             let limit = worst.frame.neighbor.distance;

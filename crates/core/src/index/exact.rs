@@ -13,9 +13,10 @@ const QUERIES: usize = 4;
 
 /// Latents by row, and the frame of each row.
 ///
-/// A query first computes a lower bound for each block of rows, in f32. The blocks are searched in the order of
-/// their bounds, until none can hold a row that is nearer than those found: first in f32, then, for the rows
-/// that are near enough in spite of the error of f32, in f64. Answers and their order are those of a scan in f64.
+/// A query first computes a lower bound for each block of rows, in f32. The blocks are searched in
+/// the order of their bounds, until none can hold a row that is nearer than those found: first in
+/// f32, then, for the rows that are near enough in spite of the error of f32, in f64. Answers and
+/// their order are those of a scan in f64.
 #[derive(Debug, Clone)]
 pub struct ExactIndex {
     /// In ascending order.
@@ -35,7 +36,8 @@ impl ExactIndex {
         Self::of_frames(latents.select(Axis(0), &rows).view(), &frames)
     }
 
-    /// Indexes the rows of `latents` (n, k), one for each of `frames`, which are in ascending order.
+    /// Indexes the rows of `latents` (n, k), one for each of `frames`, which are in ascending
+    /// order.
     pub fn of_frames(latents: ArrayView2<'_, f64>, frames: &[FrameId]) -> Self {
         Self {
             frames: frames.to_vec(),
@@ -121,7 +123,8 @@ impl Search<'_> {
             return self.nearest.found();
         }
 
-        // First the most promising blocks, with enough rows for an answer. They give the limit for the others.
+        // First the most promising blocks, with enough rows for an answer. They give the limit for
+        // the others.
         let wanted = self.nearest.count().saturating_add(self.excluded.len());
         let least = nth_least(bounds, wanted.div_ceil(LANES));
         self.search_each(bounds, |bound| bound <= least);

@@ -1,5 +1,5 @@
-//! Approximate distances of all rows from a query in f32, and lower bounds of them that read a few columns
-//! only.
+//! Approximate distances of all rows from a query in f32, and lower bounds of them that read a few
+//! columns only.
 
 use multiversion::multiversion;
 use ndarray::{Array2, ArrayView2, Axis};
@@ -9,13 +9,13 @@ use crate::matrices::{to_nalgebra, to_ndarray};
 /// Rows of a block: they are compared together, by SIMD instructions where there are any.
 pub const LANES: usize = 16;
 
-/// Directions whose coordinates a lower bound reads. Latents of an adapter vary in about six directions, as motions
-/// do.
+/// Directions whose coordinates a lower bound reads. Latents of an adapter vary in about six
+/// directions, as motions do.
 const DIRECTIONS: usize = 7;
 /// The coordinates along the directions and the length of the rest.
 const BOUND_COLUMNS: usize = DIRECTIONS + 1;
-/// Blocks whose bounds are computed before the least of each is taken: in one loop, the compiler would not use
-/// whole registers.
+/// Blocks whose bounds are computed before the least of each is taken: in one loop, the compiler
+/// would not use whole registers.
 const BLOCKS_AT_A_TIME: usize = 16;
 /// Approximate number of rows that the directions are chosen by.
 const CHOOSING_ROWS: usize = 1_024;
@@ -28,20 +28,21 @@ const ROUNDING: [f64; 2] = [f32::EPSILON as f64 / 2.0, f64::EPSILON / 2.0];
 /// The largest sum of squares that is computed in f32: above it, f32 could overflow.
 const LARGEST_SQUARE: f64 = 1e37;
 
-/// Rows that are ordered by score: ‖x‖²/2 − x·q for row x and query q. As ‖x − q‖²/2 is the score plus
-/// ‖q‖²/2, the order is that of the distances.
+/// Rows that are ordered by score: ‖x‖²/2 − x·q for row x and query q. As ‖x − q‖²/2 is the score
+/// plus ‖q‖²/2, the order is that of the distances.
 ///
-/// With orthonormal directions D, x·q is at most Dx·Dq plus the product of the lengths of what the directions
-/// leave of x and q (Cauchy and Schwarz). So a lower bound of the score reads [`BOUND_COLUMNS`] numbers of a
-/// row, however wide it is. It is close if the directions carry most of the rows' variance.
+/// With orthonormal directions D, x·q is at most Dx·Dq plus the product of the lengths of what the
+/// directions leave of x and q (Cauchy and Schwarz). So a lower bound of the score reads
+/// [`BOUND_COLUMNS`] numbers of a row, however wide it is. It is close if the directions carry most
+/// of the rows' variance.
 #[derive(Debug, Clone)]
 pub struct ScoredRows {
     /// Subtracted from rows and queries: errors of rounding grow with the numbers.
     mean: Vec<f64>,
     /// D, shape (at most [`DIRECTIONS`], k).
     directions: Array2<f64>,
-    /// The rows in blocks of [`LANES`]; for each column, its values in the block's rows. Zeros fill the last
-    /// block.
+    /// The rows in blocks of [`LANES`]; for each column, its values in the block's rows. Zeros fill
+    /// the last block.
     columns: Vec<[f32; LANES]>,
     /// The same for Dx and the length of the rest.
     bound_columns: Vec<[[f32; LANES]; BOUND_COLUMNS]>,
@@ -72,7 +73,8 @@ impl ScoredQuery {
         self.error.is_finite()
     }
 
-    /// The most that the computed score, or its computed lower bound, of a row at most this far away can be.
+    /// The most that the computed score, or its computed lower bound, of a row at most this far
+    /// away can be.
     pub fn score_at(&self, distance: f64) -> f32 {
         let score = 0.5 * distance * distance - self.half_square;
         // Twice the error: the distance is rounded too.
@@ -144,12 +146,12 @@ impl ScoredRows {
         }
     }
 
-    /// Upper bound of the error of a score and of a lower bound for a query of this length without the mean,
-    /// and with it.
+    /// Upper bound of the error of a score and of a lower bound for a query of this length without
+    /// the mean, and with it.
     ///
-    /// With w columns and lengths up to s, either is a sum of w + 1 terms of at most s². Each operand and each
-    /// partial sum is rounded to f32, and before that the difference from the mean, the coordinates and the
-    /// directions to f64.
+    /// With w columns and lengths up to s, either is a sum of w + 1 terms of at most s². Each
+    /// operand and each partial sum is rounded to f32, and before that the difference from the
+    /// mean, the coordinates and the directions to f64.
     fn error(&self, centered: f64, query: f64) -> f64 {
         let spread = self.largest_norm + centered;
         let operand = self.largest_operand + query;
@@ -197,7 +199,8 @@ fn norm<'a>(row: impl IntoIterator<Item = &'a f64>) -> f64 {
 /// [`DIRECTIONS`], k), by subspace iteration. Bounds hold for any orthonormal directions.
 fn directions(rows: &[f64], width: usize) -> Array2<f64> {
     let count = DIRECTIONS.min(width);
-    // The columns of the largest squares come first: the iteration needs a start that is not constant.
+    // The columns of the largest squares come first: the iteration needs a start that is not
+    // constant.
     let mut squares = vec![0.0; width];
     for row in rows.chunks_exact(width.max(1)) {
         for (sum, x) in squares.iter_mut().zip(row) {
@@ -242,8 +245,8 @@ fn of_bound(directions: &Array2<f64>, mut row: Vec<f64>) -> [f64; BOUND_COLUMNS]
     found
 }
 
-/// [`ScoredRows::least_bounds`] by the widest instructions of this processor. Loops over indexes: closures
-/// would be compiled without those instructions.
+/// [`ScoredRows::least_bounds`] by the widest instructions of this processor. Loops over indexes:
+/// closures would be compiled without those instructions.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
 fn least_bounds<const QUERIES: usize>(
     columns: &[[[f32; LANES]; BOUND_COLUMNS]],

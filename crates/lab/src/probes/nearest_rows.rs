@@ -1,8 +1,8 @@
 //! The nearest rows of every row.
 //!
-//! Scores of all pairs come from matrix products in f32. The rows whose scores are low enough to be among the
-//! nearest, in spite of the error of f32, are compared in f64: the expansion ‖x‖² − 2xy + ‖y‖² would cancel for
-//! near duplicates. So the answer is that of comparing all pairs in f64.
+//! Scores of all pairs come from matrix products in f32. The rows whose scores are low enough to be
+//! among the nearest, in spite of the error of f32, are compared in f64: the expansion ‖x‖² − 2xy +
+//! ‖y‖² would cancel for near duplicates. So the answer is that of comparing all pairs in f64.
 
 use std::ops::Range;
 
@@ -22,8 +22,9 @@ pub struct TooFewCandidates {
     pub row: usize,
 }
 
-/// The `k` nearest rows of each row with their distances, nearest first; ties go to the smaller row. `excluded`
-/// gives the rows that are no candidates of a row; it has to contain the row itself, and end within the rows.
+/// The `k` nearest rows of each row with their distances, nearest first; ties go to the smaller
+/// row. `excluded` gives the rows that are no candidates of a row; it has to contain the row
+/// itself, and end within the rows.
 ///
 /// # Errors
 /// [`TooFewCandidates`] for the first row with fewer than `k`.
@@ -103,8 +104,8 @@ impl Scores {
         let mut scores: Vec<f32> = scores.map(|(half, product)| half - product).collect();
         scores[excluded.clone()].fill(f32::INFINITY);
 
-        // A score of w columns is a sum of w + 1 terms, which are at most 1 together; operands and partial sums
-        // are rounded. Both scores of a comparison may be wrong.
+        // A score of w columns is a sum of w + 1 terms, which are at most 1 together; operands and
+        // partial sums are rounded. Both scores of a comparison may be wrong.
         let roundings = 2.0 * (self.rows.ncols() + 2) as f32;
         let limit = kth_at_most(&scores, k) + 2.0 * roundings * f32::EPSILON;
         let is_near = |&row: &usize| scores[row] <= limit || !scores[row].is_finite();
@@ -113,8 +114,9 @@ impl Scores {
     }
 }
 
-/// An upper bound of the `k`-th least number: at least `k` numbers are at most the `k`-th of the least ones of
-/// parts. Neighboring numbers are in different parts, because neighboring rows are alike.
+/// An upper bound of the `k`-th least number: at least `k` numbers are at most the `k`-th of the
+/// least ones of parts. Neighboring numbers are in different parts, because neighboring rows are
+/// alike.
 fn kth_at_most(numbers: &[f32], k: usize) -> f32 {
     let parts = PARTS.max(4 * k);
     let mut least = vec![f32::INFINITY; parts];
@@ -132,7 +134,8 @@ fn kth_at_most(numbers: &[f32], k: usize) -> f32 {
 mod tests {
     use super::*;
 
-    /// Oracle: comparing all pairs in f64, among duplicates, near ties, and far from zero and from one.
+    /// Oracle: comparing all pairs in f64, among duplicates, near ties, and far from zero and from
+    /// one.
     #[test]
     fn the_nearest_rows_are_those_of_all_pairs() {
         for (columns, scale, offset, noise) in [
@@ -163,7 +166,8 @@ mod tests {
         }
     }
 
-    /// Oracle: by hand: of six rows, row 2 may have rows 0 and 5 as neighbors, the others all but themselves.
+    /// Oracle: by hand: of six rows, row 2 may have rows 0 and 5 as neighbors, the others all but
+    /// themselves.
     #[test]
     fn a_row_with_too_few_candidates_is_named() {
         let rows = Array2::from_shape_fn((6, 1), |(row, _)| row as f64);
