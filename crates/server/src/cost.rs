@@ -74,8 +74,8 @@ impl Costs<'_> {
         let (room_count, comparisons) = match rooms {
             [] => {
                 let all = self.snapshot.rooms();
-                let comparisons: f64 = all.keys().map(|room| self.comparisons(room)).sum();
-                (all.len(), comparisons)
+                let count = || all.keys().map(|room| self.comparisons(room)).sum();
+                (all.len(), self.snapshot.searches().comparisons(count))
             }
             named => {
                 // A list with more names than there are rooms is refused later.

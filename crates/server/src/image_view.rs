@@ -128,7 +128,7 @@ impl<'a> ImageView<'a> {
         fields: ViewFields<'a>,
         view: Option<&pb::View>,
         camera: Option<&pb::ViewCamera>,
-        rooms: &[Arc<ServedRoom>],
+        rooms: &[&Arc<ServedRoom>],
     ) -> Result<Option<Self>, Error> {
         let camera = camera
             .map(|camera| convert::image_camera(fields.camera, camera))
@@ -173,12 +173,12 @@ impl<'a> ImageView<'a> {
     /// be loaded; [`Error::Cancelled`] once `cancel` is set.
     pub fn matched(
         &self,
-        rooms: &[Arc<ServedRoom>],
+        rooms: &[&Arc<ServedRoom>],
         searched: Searched,
         cancel: &Cancellation,
     ) -> Result<RoomMatches, Error> {
         let mut tried = Vec::new();
-        for room in rooms {
+        for &room in rooms {
             cancel.check()?;
             match self.matched_with(room, rooms.len() == 1) {
                 Ok(Some(found)) => tried.push((room.clone(), found)),
@@ -287,9 +287,9 @@ pub fn check_aspect(width: usize, height: usize, camera: &CameraIntrinsics) -> R
 /// The first room whose keypoints this server can match, with their encoder.
 fn first_with_keypoints<'a>(
     snapshot: &'a Snapshot,
-    rooms: &'a [Arc<ServedRoom>],
+    rooms: &[&'a Arc<ServedRoom>],
 ) -> Option<(&'a ServedRoom, &'a ImageEncoder)> {
-    rooms.iter().find_map(|room| {
+    rooms.iter().find_map(|&room| {
         let source = room.summary.keypoints.as_ref()?;
         Some((room.as_ref(), snapshot.keypoint_encoder(source)?))
     })

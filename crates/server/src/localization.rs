@@ -9,7 +9,9 @@ use tonic::{Request, Response, Status};
 use super::convert;
 use super::cost::{check_batch, check_batch_pixels};
 use super::image_view::{ImageView, RoomMatches, Searched, ViewFields};
-use super::snapshot::{FittedReader, ServedNavigator, ServedRoom};
+use super::snapshot::{
+    FittedReader, FoundRooms, Search, SearchedRooms, ServedNavigator, ServedRoom, ServedRooms,
+};
 use super::status::view_error;
 use super::workers::Lane;
 use super::{Error, Handlers, Snapshot};
@@ -17,7 +19,7 @@ use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::localization_service_server::LocalizationService;
 use seese3_core::cancel::Cancellation;
 use seese3_core::keypoints::KeypointSource;
-use seese3_core::localization::{Place, localize};
+use seese3_core::localization::{Place, joint_index, localize, localize_jointly};
 use seese3_core::navigation::{Error as E, Source, Start, StepError};
 use seese3_core::room::{self, FrameId, RoomId};
 use seese3_robot::fitting::MotionReader;
@@ -158,11 +160,9 @@ fn answer(
         None => pb::LocalizeResponse::default(),
     };
 
-    let served = || retrieved.iter().flat_map(|retrieved| &retrieved.served);
-    let matched: BTreeSet<&RoomId> = matches.rooms().collect();
-    let also_matched = served().filter(|served| matched.contains(served.navigator.room().id()));
-    response.room_count = (served().count() + matched.len() - also_matched.count()) as u32;
-    response.exact = served().all(|served| served.navigator.audit().is_none());
+    let served = retrieved.as_ref().map(|retrieved| &retrieved.served);
+    response.room_count = room_count(served, &matches) as u32;
+    response.exact = served.is_none_or(|served| served.is_exact());
 
     fill_pose(&mut response, matches, retrieved.as_ref())?;
     if response.method() != pb::LocalizationMethod::MatchedKeypoints
@@ -174,6 +174,18 @@ fn answer(
     Ok(response)
 }
 
+/// Number of rooms that were compared, by latents or by keypoints.
+pub(super) fn room_count(by_latent: Option<&ServedRooms>, matches: &RoomMatches) -> usize {
+    let matched: BTreeSet<&RoomId> = matches.rooms().collect();
+    let by_latent = by_latent.map_or(&[][..], |rooms| rooms);
+    if matched.is_empty() {
+        return by_latent.len();
+    }
+    let is_not_matched =
+        |served: &&Arc<ServedNavigator>| !matched.contains(served.navigator.room().id());
+    matched.len() + by_latent.iter().filter(is_not_matched).count()
+}
+
 /// The answer for a stored frame of a room without an adapter; `None` for any other request.
 ///
 /// # Errors
@@ -181,7 +193,7 @@ fn answer(
 /// loaded.
 fn recorded(
     snapshot: &Snapshot,
-    asked: &[Arc<ServedRoom>],
+    asked: &[&Arc<ServedRoom>],
     adapter: &str,
     view: Option<&pb::View>,
 ) -> Result<Option<pb::LocalizeResponse>, Error> {
@@ -214,12 +226,12 @@ fn recorded(
 ///
 /// # Errors
 /// [`Error::NotFound`] for an unknown room, [`Error::Invalid`] if a room is named twice.
-pub(super) fn asked_rooms(
-    snapshot: &Snapshot,
+pub(super) fn asked_rooms<'a>(
+    snapshot: &'a Snapshot,
     rooms: &[String],
-) -> Result<Vec<Arc<ServedRoom>>, Error> {
+) -> Result<Vec<&'a Arc<ServedRoom>>, Error> {
     if rooms.is_empty() {
-        return Ok(snapshot.rooms().values().cloned().collect());
+        return Ok(snapshot.rooms().values().collect());
     }
 
     let mut asked = Vec::new();
@@ -229,7 +241,7 @@ pub(super) fn asked_rooms(
         if rooms[..position].contains(room) {
             return Err(Error::invalid("rooms", format!("'{room}' is named twice")));
         }
-        asked.push(served.clone());
+        asked.push(served);
     }
 
     Ok(asked)
@@ -238,7 +250,7 @@ pub(super) fn asked_rooms(
 /// A view to compare with rooms under one adapter, so that it is embedded once and distances are
 /// comparable between rooms.
 struct ComparedView {
-    served: Vec<Arc<ServedNavigator>>,
+    served: ServedRooms,
     source: Source,
 }
 
@@ -262,7 +274,7 @@ fn retrieved(
 
 /// A view with its most similar frames.
 struct Retrieved {
-    served: Vec<Arc<ServedNavigator>>,
+    served: ServedRooms,
     source: Source,
     start: Start,
     places: Vec<Place>,
@@ -288,8 +300,15 @@ impl ComparedView {
             other => Error::from(other),
         })?;
 
-        let navigators = served.iter().map(|served| served.navigator.as_ref());
-        let places = localize(navigators, start.latent.view(), k, cancel)?;
+        let navigators = || served.iter().map(|served| served.navigator.as_ref());
+        let joint = served.joint(k, |rooms| {
+            joint_index(rooms.iter().map(|served| served.navigator.as_ref()))
+        });
+        let latent = start.latent.view();
+        let places = match joint {
+            Some(joint) => localize_jointly(joint, |room| &served[room].navigator, latent, k),
+            None => localize(navigators(), latent, k, cancel)?,
+        };
         Ok(Retrieved {
             served,
             source,
@@ -304,13 +323,7 @@ impl Retrieved {
     fn nearest_room(&self) -> Result<&ServedNavigator, Error> {
         // At least one frame is retrieved.
         let place = self.places.first().ok_or(Error::Internal)?;
-        self.navigator_of(&place.room)
-    }
-
-    fn navigator_of(&self, room: &RoomId) -> Result<&ServedNavigator, Error> {
-        let mut served = self.served.iter();
-        let found = served.find(|served| served.navigator.room().id() == room);
-        found.map(AsRef::as_ref).ok_or(Error::Internal)
+        Ok(&self.served[place.room])
     }
 
     fn query(&self) -> MapQuery<'_> {
@@ -325,7 +338,7 @@ impl Retrieved {
 
     fn frames_to_wire(&self) -> Result<Vec<pb::SimilarFrame>, Error> {
         let place = |place: &Place| {
-            let served = self.navigator_of(&place.room)?;
+            let served = &self.served[place.room];
             let room = served.navigator.room();
             Ok(pb::SimilarFrame {
                 room: Some(convert::room_revision(served)),
@@ -388,7 +401,7 @@ fn fill_pose(
 }
 
 /// Why keypoints were not tried with the rooms; empty if none has keypoints.
-fn not_tried(snapshot: &Snapshot, asked: &[Arc<ServedRoom>]) -> String {
+fn not_tried(snapshot: &Snapshot, asked: &[&Arc<ServedRoom>]) -> String {
     let sources = asked
         .iter()
         .filter_map(|room| room.summary.keypoints.as_ref());
@@ -574,7 +587,24 @@ pub(super) fn rooms_under(
     snapshot: &Snapshot,
     rooms: &[String],
     adapter: &str,
-) -> Result<Vec<Arc<ServedNavigator>>, Error> {
+) -> Result<ServedRooms, Error> {
+    if rooms.is_empty() {
+        let find = || found_rooms(snapshot, rooms, adapter);
+        return snapshot.searches().rooms(Search::Retrieve, adapter, find);
+    }
+    let found = found_rooms(snapshot, rooms, adapter)?;
+    Ok(Arc::new(SearchedRooms::new(found.rooms)))
+}
+
+/// As [`rooms_under`], looked up anew.
+///
+/// # Errors
+/// As [`rooms_under`].
+pub(super) fn found_rooms(
+    snapshot: &Snapshot,
+    rooms: &[String],
+    adapter: &str,
+) -> Result<FoundRooms, Error> {
     asked_rooms(snapshot, rooms)?;
 
     let rooms = &rooms_or_only(snapshot, rooms)[..];
@@ -585,19 +615,23 @@ pub(super) fn rooms_under(
     };
 
     if !rooms.is_empty() {
-        return rooms
-            .iter()
-            .map(|room| snapshot.navigator(room, &adapter))
-            .collect();
+        let served = rooms.iter().map(|room| snapshot.navigator(room, &adapter));
+        return Ok(FoundRooms {
+            rooms: served.collect::<Result<_, _>>()?,
+            is_final: true,
+        });
     }
 
     // In a search of all rooms, skip damaged rooms, like those refused at loading. The log and the
     // rooms' health report them.
     let mut served = Vec::new();
+    let mut is_final = true;
     for room in snapshot.rooms().values() {
         if !room.is_served_by(&adapter) {
             continue;
         }
+        // Before a room is loaded, the choice of the adapter goes by its candidates.
+        is_final &= room.is_in_memory() || room.refusal().is_some_and(|refusal| !refusal.may_pass);
         match room.load() {
             Ok(loaded) => served.extend(loaded.under_any(&adapter).cloned()),
             Err(Error::Precondition(_)) => {}
@@ -610,5 +644,8 @@ pub(super) fn rooms_under(
             "no room has the features of adapter '{adapter}'"
         )));
     }
-    Ok(served)
+    Ok(FoundRooms {
+        rooms: served,
+        is_final,
+    })
 }

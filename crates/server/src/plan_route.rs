@@ -318,7 +318,7 @@ impl MatchedSource {
             camera: "camera",
         };
         let room = snapshot.room(served.navigator.room().id().as_str())?;
-        let room = std::slice::from_ref(room);
+        let room = &[room];
         let Some(image) = ImageView::of(snapshot, fields, source, camera, room)? else {
             return Ok(Self::default());
         };

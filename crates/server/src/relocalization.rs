@@ -9,17 +9,23 @@ use tonic::{Request, Response, Status};
 use super::convert;
 use super::embedding::{EmbeddedView, StoredFrames, ViewEmbedder};
 use super::image_view::{ImageView, RoomMatches, Searched, ViewFields};
-use super::localization::{LocatedPose, asked_rooms, localizer, rooms_or_only, rooms_under};
-use super::snapshot::{ServedNavigator, ServedRoom, Snapshot};
+use super::localization::{
+    LocatedPose, asked_rooms, found_rooms, localizer, room_count, rooms_or_only,
+};
+use super::snapshot::{
+    FoundRooms, Search, SearchedRooms, ServedNavigator, ServedRoom, ServedRooms, Snapshot,
+};
 use super::workers::{image_count, images_of};
 use super::{Error, Handlers};
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
+use seese3_core::index::JointIndex;
 use seese3_core::navigation::RetrievedFrame;
 use seese3_core::room::RoomId;
 use seese3_robot::localization::{LocatedView, NotLocated, PoseEstimate};
 use seese3_robot::tracking::{
-    self, Map, MapQuery, ROOM_RATIO, Relocalization, RoomMatch, relocalize,
+    self, Map, MapQuery, ROOM_RATIO, Relocalization, RoomMatch, joint_map_index, relocalize,
+    relocalize_jointly,
 };
 use seese3_store::StoredAdapter;
 
@@ -95,9 +101,11 @@ fn answer(
         None => RoomMatches::default(),
     };
 
-    // Then compare latents. Without them, keypoints still answer.
-    let compared = rooms_with_maps(snapshot, &rooms, &adapter)
-        .and_then(|served| ByLatent::of(served, views, snapshot, cancel));
+    // Then compare latents. Without them, keypoints still answer. The distances of rooms that keypoints locate are
+    // shown regardless of their rank.
+    let wanted = matches.rooms().next().is_none().then_some(shown);
+    let compared = rooms_to_track_in(snapshot, &rooms, &adapter)
+        .and_then(|served| ByLatent::of(served, views, snapshot, wanted, cancel));
     let by_latent = match compared {
         Err(Error::Precondition(_) | Error::Invalid { .. })
             if adapter.is_empty() && matches.rooms().next().is_some() =>
@@ -116,39 +124,32 @@ fn answer(
     )
 }
 
-/// Rooms under one adapter, each with its map.
-struct RoomsWithMaps {
-    served: Vec<Arc<ServedNavigator>>,
-    maps: Vec<Arc<Map>>,
-}
-
-fn rooms_with_maps(
-    snapshot: &Snapshot,
-    rooms: &[String],
-    adapter: &str,
-) -> Result<RoomsWithMaps, Error> {
-    let served = rooms_to_track_in(snapshot, rooms, adapter)?;
-    let maps = maps(&served)?;
-    Ok(RoomsWithMaps { served, maps })
-}
-
 /// The rooms compared by the latents of the views.
 struct ByLatent {
-    served: Vec<Arc<ServedNavigator>>,
+    served: ServedRooms,
     found: Relocalization,
     newest: EmbeddedView,
 }
 
 impl ByLatent {
+    /// Compares the views with all rooms, and ranks them; only the best `wanted` rooms if it is given.
     fn of(
-        RoomsWithMaps { served, maps }: RoomsWithMaps,
+        served: ServedRooms,
         views: Vec<pb::View>,
         snapshot: &Snapshot,
+        wanted: Option<usize>,
         cancel: &Cancellation,
     ) -> Result<Self, Error> {
+        let maps = maps(&served)?;
         let mut views = embedded(views, &served[0].adapter, snapshot, cancel)?;
         let queries: Vec<MapQuery<'_>> = views.iter().map(query_of).collect();
-        let found = relocalize(&maps, &queries, cancel).map_err(|error| match error {
+        let joint = wanted.zip(<[MapQuery<'_>; 1]>::try_from(&queries[..]).ok());
+        let joint = joint.and_then(|known| Some((known, served.joint(known.0, joint_of)?)));
+        let found = match joint {
+            Some(((wanted, [view]), joint)) => relocalize_jointly(&maps, joint, view, wanted),
+            None => relocalize(&maps, &queries, cancel),
+        };
+        let found = found.map_err(|error| match error {
             tracking::Error::Cancelled => Error::Cancelled,
             _ => Error::Internal,
         })?;
@@ -168,6 +169,11 @@ impl ByLatent {
         let rooms = self.found.rooms.iter();
         rooms.map(|room| (room, self.served[room.map].as_ref()))
     }
+}
+
+/// The index of the rooms' maps; `None` if it cannot be made.
+fn joint_of(served: &[Arc<ServedNavigator>]) -> Option<JointIndex> {
+    joint_map_index(&maps(served).ok()?).ok()?
 }
 
 fn query_of(view: &EmbeddedView) -> MapQuery<'_> {
@@ -193,12 +199,14 @@ fn ranked(
     shown: Shown,
 ) -> Result<pb::RelocalizeResponse, Error> {
     let mut rooms: Vec<pb::RoomMatch> = matches.located.iter().map(located_to_wire).collect();
-    let mut compared: BTreeSet<&RoomId> =
-        matches.located.iter().map(|(room, _)| &room.id).collect();
+    let located: BTreeSet<&RoomId> = matches.located.iter().map(|(room, _)| &room.id).collect();
+    let mut only_matched: BTreeSet<&RoomId> =
+        matches.unmatched.iter().map(|(room, _)| &room.id).collect();
 
     for (room, served) in by_latent.iter().flat_map(|compared| compared.rooms()) {
         let id = served.navigator.room().id();
-        let is_located = !compared.insert(id);
+        let is_located = located.contains(id);
+        only_matched.remove(id);
         if !is_located && rooms.len() >= shown.rooms {
             continue;
         }
@@ -218,7 +226,7 @@ fn ranked(
     }
 
     for (room, why) in &matches.unmatched {
-        if compared.insert(&room.id) {
+        if only_matched.contains(&room.id) {
             let nowhere = PoseEstimate::choose(Some(Err(*why)), || None);
             rooms.push(match_to_wire(
                 convert::served_revision(room),
@@ -228,12 +236,11 @@ fn ranked(
     }
 
     let verdict = verdict(matches, by_latent);
-    let room_count = compared.len() as u32;
     rooms.truncate(shown.rooms);
     Ok(pb::RelocalizeResponse {
         adapter: by_latent.map(|found| convert::adapter_revision(&found.served[0])),
         rooms,
-        room_count,
+        room_count: room_count(by_latent.map(|found| &found.served), matches) as u32,
         margin: verdict.margin,
         ambiguous: !verdict.reason.is_empty(),
         reason: verdict.reason,
@@ -331,7 +338,21 @@ pub fn rooms_to_track_in(
     snapshot: &Snapshot,
     rooms: &[String],
     adapter: &str,
-) -> Result<Vec<Arc<ServedNavigator>>, Error> {
+) -> Result<ServedRooms, Error> {
+    if rooms.is_empty() {
+        let find = || found_rooms_to_track_in(snapshot, rooms, adapter);
+        return snapshot.searches().rooms(Search::Track, adapter, find);
+    }
+    let found = found_rooms_to_track_in(snapshot, rooms, adapter)?;
+    Ok(Arc::new(SearchedRooms::new(found.rooms)))
+}
+
+/// As [`rooms_to_track_in`], looked up anew.
+fn found_rooms_to_track_in(
+    snapshot: &Snapshot,
+    rooms: &[String],
+    adapter: &str,
+) -> Result<FoundRooms, Error> {
     let adapter = match adapter {
         "" => {
             asked_rooms(snapshot, rooms)?;
@@ -347,12 +368,12 @@ pub fn rooms_to_track_in(
         name => name.to_owned(),
     };
 
-    let mut served = rooms_under(snapshot, rooms, &adapter)?;
-    if rooms.is_empty() && served.iter().any(|served| served.map.is_some()) {
-        served.retain(|served| served.map.is_some());
+    let mut found = found_rooms(snapshot, rooms, &adapter)?;
+    if rooms.is_empty() && found.rooms.iter().any(|served| served.map.is_some()) {
+        found.rooms.retain(|served| served.map.is_some());
     }
 
-    Ok(served)
+    Ok(found)
 }
 
 /// Whether some adapter can track in these rooms; in any room if none is named.
@@ -387,14 +408,19 @@ fn tracking_adapter(snapshot: &Snapshot, rooms: &[String]) -> Result<Option<Stri
 /// # Errors
 /// [`Error::Precondition`] if a room has no map: the adapter is not calibrated, or the room is too
 /// small. The message states which.
-pub fn maps(served: &[Arc<ServedNavigator>]) -> Result<Vec<Arc<Map>>, Error> {
-    let map = |served: &Arc<ServedNavigator>| {
-        let name = &served.adapter.name;
-        let room = served.navigator.room().id();
-
-        served.map.clone().ok_or_else(|| {
-            Error::Precondition(match served.adapter.adapter.error_model() {
-                None if served.adapter.room_fit.is_some() => format!(
+pub fn maps(served: &[Arc<ServedNavigator>]) -> Result<Vec<&Arc<Map>>, Error> {
+    let map = |served| {
+        let ServedNavigator {
+            map,
+            adapter,
+            navigator,
+            ..
+        }: &ServedNavigator = served;
+        map.as_ref().ok_or_else(|| {
+            let name = &adapter.name;
+            let room = navigator.room().id();
+            Error::Precondition(match adapter.adapter.error_model() {
+                None if adapter.room_fit.is_some() => format!(
                     "adapter '{name}' is fitted to room '{room}' and neither tracks nor relocalizes by itself: name none, \
                      or the calibrated adapter from which it was fitted; the fitted one locates its views"
                 ),
@@ -407,7 +433,7 @@ pub fn maps(served: &[Arc<ServedNavigator>]) -> Result<Vec<Arc<Map>>, Error> {
         })
     };
 
-    served.iter().map(map).collect()
+    served.iter().map(AsRef::as_ref).map(map).collect()
 }
 
 /// A room in which keypoints give a pose, as a wire message.

@@ -37,6 +37,8 @@
 
 pub mod fit_stored_room;
 mod bucket;
+mod conditional_writes;
+mod object_cache;
 mod publication;
 mod manifest;
 mod resource;
@@ -73,6 +75,7 @@ pub use derived::{Derived, DerivedKey};
 pub use extension::{AddedPart, ExtendedRoom, OtherFeatures};
 pub use garbage::{Garbage, GarbageFile, GarbagePolicy, Publishers};
 pub use map_edits::EditedRoom;
+pub use object_cache::ObjectCache;
 pub use publication::{Clock, GRACE, LONGEST_PUBLICATION, UploadPolicy};
 pub use quota::{Quota, Quotas, Scope};
 pub use removal::Removed;
@@ -85,6 +88,7 @@ pub use verification::Finding;
 
 use seese3_core::Cause;
 use std::collections::BTreeSet;
+use std::ffi::OsString;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -93,6 +97,7 @@ use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt, PutMode, PutOptions, PutPayload};
 use publication::Publication;
 use sha2::{Digest, Sha256};
+use tokio::sync::OnceCell;
 
 /// Errors of reading and writing the store. Each message names the file, room or adapter and, where
 /// there is a remedy, the remedy.
@@ -111,6 +116,11 @@ pub enum Error {
         #[source]
         problem: Cause,
     },
+    #[error(
+        "store '{location}' does not support writes with If-None-Match, so that concurrent publishers could overwrite each \
+         other's revisions; use a server that supports this header"
+    )]
+    NotConditional { location: String },
     #[error(
         "store '{location}' does not exist; make one with `seese3 import … --store {location}`"
     )]
@@ -284,6 +294,10 @@ pub struct Store {
     clock: Clock,
     /// Limits of publications.
     quotas: Arc<Quotas>,
+    /// Objects that were read before.
+    cache: Option<Arc<ObjectCache>>,
+    /// Set once the server was seen to support conditional writes; `None` for a store opened as a folder.
+    is_conditional: Option<Arc<OnceCell<()>>>,
 }
 
 /// The numbers of the files in a folder of numbered files, such as `revisions/`.
@@ -315,7 +329,7 @@ impl Store {
     /// that compute for minutes before they publish.
     ///
     /// # Errors
-    /// [`Error::ReadOnly`] if it cannot be written.
+    /// [`Error::ReadOnly`] if it cannot be written; in a bucket also as [`Store::check_conditional_writes`].
     pub async fn check_writable(&self) -> Result<(), Error> {
         let since = std::time::UNIX_EPOCH.elapsed().unwrap_or_default();
         let probe = format!("probe-{}-{}", std::process::id(), since.as_nanos());
@@ -326,7 +340,8 @@ impl Store {
         };
         let written = self.objects.put(&probe, PutPayload::new()).await;
         written.map_err(read_only)?;
-        self.objects.delete(&probe).await.map_err(read_only)
+        self.objects.delete(&probe).await.map_err(read_only)?;
+        self.check_conditional_writes().await
     }
 
     /// Opens the store in an existing folder, or at an object-store URL.
@@ -335,6 +350,21 @@ impl Store {
     /// [`Error::Missing`] if the folder does not exist; [`Error::Open`] if the URL is not valid or
     /// not supported, or if the folder cannot be opened.
     pub fn open(location: &str) -> Result<Self, Error> {
+        let text = |(name, value): (OsString, OsString)| {
+            Some((name.into_string().ok()?, value.into_string().ok()?))
+        };
+        Self::open_with(
+            location,
+            &std::env::vars_os().filter_map(text).collect::<Vec<_>>(),
+        )
+    }
+
+    /// As [`Store::open`], where `variables` stand for the environment, from which the settings of a bucket are read:
+    /// names and values.
+    ///
+    /// # Errors
+    /// As [`Store::open`].
+    pub fn open_with(location: &str, variables: &[(String, String)]) -> Result<Self, Error> {
         let failed = |problem: Cause| Error::Open {
             location: location.to_owned(),
             problem,
@@ -342,19 +372,14 @@ impl Store {
 
         if location.contains("://") {
             let url = url::Url::parse(location).map_err(|error| failed(error.into()))?;
-            let (objects, prefix) = bucket::open(&url).map_err(|problem| failed(problem.into()))?;
+            let (objects, prefix) =
+                bucket::open(&url, variables).map_err(|problem| failed(problem.into()))?;
 
             // From here on, all paths are relative to the folder in the URL, as they are for a
             // local store.
             let objects = object_store::prefix::PrefixStore::new(objects, prefix);
 
-            return Ok(Self {
-                objects: Arc::new(objects),
-                location: location.to_owned(),
-                folder: None,
-                clock: Clock::default(),
-                quotas: Arc::default(),
-            });
+            return Ok(Self::with_objects(Arc::new(objects), location).with_write_check());
         }
 
         if !std::path::Path::new(location).is_dir() {
@@ -371,11 +396,8 @@ impl Store {
         let objects = objects.with_fsync(true);
 
         Ok(Self {
-            objects: Arc::new(objects),
-            location: location.to_owned(),
             folder: Some(PathBuf::from(location)),
-            clock: Clock::default(),
-            quotas: Arc::default(),
+            ..Self::with_objects(Arc::new(objects), location)
         })
     }
 
@@ -387,6 +409,29 @@ impl Store {
             folder: None,
             clock: Clock::default(),
             quotas: Arc::default(),
+            cache: None,
+            is_conditional: None,
+        }
+    }
+
+    /// The same store, which verifies the server's support for conditional writes before the first one.
+    pub fn with_write_check(self) -> Self {
+        Self {
+            is_conditional: Some(Arc::default()),
+            ..self
+        }
+    }
+
+    /// Whether the store is at an object-store URL.
+    pub fn is_bucket(&self) -> bool {
+        self.is_conditional.is_some()
+    }
+
+    /// The same store with a cache of the objects that it reads.
+    pub fn with_cache(self, cache: ObjectCache) -> Self {
+        Self {
+            cache: Some(Arc::new(cache)),
+            ..self
         }
     }
 
@@ -456,6 +501,10 @@ impl Store {
     ) -> Result<(String, Vec<u8>), Error> {
         let path = folder.clone().join("objects").join(object.file.as_str());
         let file = self.shown(&path);
+        let cache = self.cache.as_deref();
+        if let Some(bytes) = cache.and_then(|cache| cache.get(&object.sha256)) {
+            return Ok((file, bytes));
+        }
         let bytes = match self.read(&path).await {
             Err(Error::Absent { file }) => self
                 .read_from_quarantine(folder, &object.file)
@@ -474,6 +523,9 @@ impl Store {
         } else if sha256(&bytes) != object.sha256 {
             "does not have the checksum that its manifest states: it was altered".to_owned()
         } else {
+            if let Some(Err(problem)) = cache.map(|cache| cache.put(&object.sha256, &bytes)) {
+                tracing::warn!(%problem, file, "cannot write to the store cache");
+            }
             return Ok((file, bytes));
         };
 
@@ -564,15 +616,23 @@ impl Store {
     /// Writes a file unless it exists. Returns whether it was written. Atomic, also between
     /// concurrent writers.
     async fn write_new(&self, path: &Path, bytes: Vec<u8>) -> Result<bool, Error> {
+        self.check_conditional_writes().await?;
+
         // `Create` fails if the object exists, so exactly one of several concurrent writers gets
         // the number.
         let options = PutOptions::from(PutMode::Create);
         match self
             .objects
-            .put_opts(path, PutPayload::from(bytes), options)
+            .put_opts(path, PutPayload::from(bytes.clone()), options)
             .await
         {
             Ok(_) => Ok(true),
+            // The answer to this write, or to a first attempt at it, may have been lost.
+            Err(error) if self.is_conditional.is_some() => match self.read(path).await {
+                Ok(found) if found == bytes => Ok(true),
+                _ if matches!(error, object_store::Error::AlreadyExists { .. }) => Ok(false),
+                _ => Err(self.io(path, error)),
+            },
             Err(object_store::Error::AlreadyExists { .. }) => Ok(false),
             Err(error) => Err(self.io(path, error)),
         }

@@ -5,11 +5,13 @@ use std::ops::Range;
 use ndarray::{Array2, ArrayView2, Axis};
 
 use super::scores::{LANES, ScoredQuery, ScoredRows};
-use super::{Exclusion, Index, Nearest, Neighbor, distance};
+use super::{Collector, Exclusion, Index, Nearest, Neighbor, distance};
 use crate::room::FrameId;
 
 /// Queries that are compared with the frames in one pass.
 const QUERIES: usize = 4;
+/// Growth factor of the number of blocks searched until a first limit is known.
+const MORE_BLOCKS: usize = 8;
 
 /// Latents by row, and the frame of each row.
 ///
@@ -75,8 +77,28 @@ impl ExactIndex {
                 nearest: Nearest::new(k),
             };
             let bounds: Vec<f32> = bounds.iter().map(|bounds| bounds[which]).collect();
-            search.found(&bounds)
+            search.found(&bounds).found()
         })
+    }
+
+    /// Number of columns.
+    pub(super) fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Searches for what `nearest` collects.
+    pub(super) fn collected<C: Collector>(&self, query: &[f64], nearest: C) -> C {
+        let scored = self.rows.query(query);
+        let bounds = self.rows.least_bounds([&scored]);
+        let search = Search {
+            index: self,
+            query,
+            scored: &scored,
+            excluded: 0..0,
+            nearest,
+        };
+        let bounds: Vec<f32> = bounds.iter().map(|[bound]| *bound).collect();
+        search.found(&bounds)
     }
 
     fn neighbor(&self, position: usize, query: &[f64]) -> Neighbor {
@@ -106,31 +128,40 @@ impl ExactIndex {
 }
 
 /// The search for one query's nearest rows.
-struct Search<'a> {
+struct Search<'a, C> {
     index: &'a ExactIndex,
     query: &'a [f64],
     scored: &'a ScoredQuery,
     /// Positions that are not answers.
     excluded: Range<usize>,
-    nearest: Nearest,
+    nearest: C,
 }
 
-impl Search<'_> {
+impl<C: Collector> Search<'_, C> {
     /// The nearest rows, given the least lower bound of each block's scores.
-    fn found(mut self, bounds: &[f32]) -> Vec<Neighbor> {
+    fn found(mut self, bounds: &[f32]) -> C {
         if !self.scored.has_scores() {
             (0..bounds.len()).for_each(|block| self.search_block(block));
-            return self.nearest.found();
+            return self.nearest;
         }
 
         // First the most promising blocks, with enough rows for an answer. They give the limit for
-        // the others.
+        // the others. If their rows belong to too few parts, search more blocks.
         let wanted = self.nearest.count().saturating_add(self.excluded.len());
-        let least = nth_least(bounds, wanted.div_ceil(LANES));
-        self.search_each(bounds, |bound| bound <= least);
+        let mut blocks = wanted.div_ceil(LANES).max(1);
+        let mut searched = f32::NEG_INFINITY;
+        loop {
+            let least = nth_least(bounds, blocks);
+            self.search_each(bounds, |bound| bound > searched && bound <= least);
+            searched = least;
+            if self.nearest.worst().is_some() || blocks >= bounds.len() {
+                break;
+            }
+            blocks = blocks.saturating_mul(MORE_BLOCKS);
+        }
         let limit = self.limit();
-        self.search_each(bounds, |bound| bound > least && bound <= limit);
-        self.nearest.found()
+        self.search_each(bounds, |bound| bound > searched && bound <= limit);
+        self.nearest
     }
 
     /// Searches some blocks, the most promising first, as long as they can hold an answer.

@@ -6,12 +6,14 @@
 
 mod scores;
 mod exact;
+mod joint;
 #[cfg(feature = "hnsw")]
 mod hnsw;
 
 pub use exact::ExactIndex;
 #[cfg(feature = "hnsw")]
 pub use hnsw::{HnswIndex, HnswParameters};
+pub use joint::{JointIndex, PartNeighbor};
 
 use crate::room::FrameId;
 
@@ -115,6 +117,37 @@ pub fn distance(a: &[f64], b: &[f64]) -> f64 {
     sum.sqrt()
 }
 
+/// Collects the results of a search.
+trait Collector {
+    /// The number that is collected.
+    fn count(&self) -> usize;
+
+    /// The largest distance collected; `None` while there are fewer than the wanted number.
+    fn worst(&self) -> Option<f64>;
+
+    /// Adds a neighbor if it is among the nearest so far.
+    fn offer(&mut self, found: Neighbor);
+}
+
+impl Collector for Nearest {
+    fn count(&self) -> usize {
+        self.count
+    }
+
+    fn worst(&self) -> Option<f64> {
+        let is_full = self.best.len() == self.count;
+        self.best
+            .last()
+            .filter(|_| is_full)
+            .map(|worst| worst.distance)
+    }
+
+    #[inline]
+    fn offer(&mut self, found: Neighbor) {
+        Self::offer(self, found);
+    }
+}
+
 /// Collects the `count` nearest neighbors, ordered by distance, then by frame.
 #[derive(Debug)]
 pub struct Nearest {
@@ -130,20 +163,6 @@ impl Nearest {
             count,
             best: Vec::new(),
         }
-    }
-
-    /// The number that is collected.
-    fn count(&self) -> usize {
-        self.count
-    }
-
-    /// The largest distance collected; `None` while there are fewer than the wanted number.
-    fn worst(&self) -> Option<f64> {
-        let is_full = self.best.len() == self.count;
-        self.best
-            .last()
-            .filter(|_| is_full)
-            .map(|worst| worst.distance)
     }
 
     /// Adds a neighbor if it is among the nearest so far.

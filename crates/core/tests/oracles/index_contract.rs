@@ -3,7 +3,7 @@
 use ndarray::Array2;
 use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
-use seese3_core::index::{ExactIndex, Exclusion, Index, distance};
+use seese3_core::index::{ExactIndex, Exclusion, Index, JointIndex, PartNeighbor, distance};
 #[cfg(feature = "hnsw")]
 use seese3_core::index::{HnswIndex, HnswParameters};
 use seese3_core::room::FrameId;
@@ -295,4 +295,50 @@ fn building_twice_gives_the_same_answers_and_the_audit_tells_a_poor_graph() {
         poor.recall < audit.recall,
         "the audit sees a poor graph: {poor:?}"
     );
+}
+
+/// Parts of a few rows each, some of them equal to each other, and queries.
+fn parts(seed: u64, count: usize) -> (Vec<Array2<f64>>, Vec<Vec<f64>>) {
+    let mut random_row = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+    let mut parts: Vec<Array2<f64>> = (0..count)
+        .map(|part| random(random_row.random_range(0..40), 6, seed + part as u64))
+        .collect();
+    if count > 2 {
+        parts[count - 1] = parts[0].clone();
+    }
+    let queries = random(8, 6, seed + 1_000)
+        .outer_iter()
+        .map(|row| row.to_vec())
+        .collect();
+    (parts, queries)
+}
+
+proptest! {
+    /// Oracle: the definition: all rows of all parts by distance, then by part, then by row; the nearest parts are
+    /// those of the first row of each in that order.
+    #[test]
+    fn a_joint_index_answers_as_its_parts(seed in 0_u64..1_000, count in 1_usize..60, k in 1_usize..50) {
+        let (parts, queries) = parts(seed, count);
+        let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
+        let index = JointIndex::of(&views).unwrap();
+
+        for query in &queries {
+            let mut all: Vec<(f64, usize, u32)> = Vec::new();
+            for (number, part) in parts.iter().enumerate() {
+                let rows = part.outer_iter().enumerate();
+                all.extend(rows.map(|(row, latent)| (distance(&latent.to_vec(), query), number, row as u32)));
+            }
+            all.sort_by(|a, b| a.partial_cmp(b).unwrap());
+            let mut firsts = all.clone();
+            let mut seen = std::collections::BTreeSet::new();
+            firsts.retain(|(_, part, _)| seen.insert(*part));
+
+            let found = |found: Vec<PartNeighbor>| -> Vec<(f64, usize, u32)> {
+                let plain = |found: &PartNeighbor| (found.neighbor.distance, found.part, found.neighbor.frame.0);
+                found.iter().map(plain).collect()
+            };
+            prop_assert_eq!(found(index.nearest(query, k)), &all[..k.min(all.len())]);
+            prop_assert_eq!(found(index.nearest_parts(query, k)), &firsts[..k.min(firsts.len())]);
+        }
+    }
 }

@@ -9,6 +9,7 @@ use seese3_core::cancel::Cancellation;
 use seese3_core::eval::{Protocol, RetrievalScores, Row, evaluate};
 use seese3_core::geometry::{Twist, body_twist, exp};
 use seese3_core::index::{ExactIndex, Index};
+use seese3_core::localization::{joint_index, localize, localize_jointly};
 use seese3_core::navigation::NavigatorKind;
 use seese3_core::navigation::{
     Leg, Mode, Navigator, Plan, Reading, RetrievalMetric, Search, Source, Space, StepKind, Stepper,
@@ -412,6 +413,35 @@ fn a_mixture_navigates_as_the_oracle(room: &str, folder: PathBuf) {
 }
 
 seese3_testing::on_oracle_rooms!(a_mixture_navigates_as_the_oracle);
+
+/// Oracle: the search of one room after the other, also for an adapter whose latents have gate weights, which distances
+/// leave out.
+#[test]
+fn rooms_are_searched_together_as_one_by_one() {
+    let folder = seese3_testing::golden();
+    for charts in [1, 2] {
+        let adapter = Arc::new(adapter_of(&folder, "synthetic", charts));
+        let rooms = [(); 3].map(|()| navigator(&folder, "synthetic", adapter.clone()));
+        let index = joint_index(&rooms).unwrap();
+        for frame in [3, 100, 250].map(FrameId) {
+            let mut latent = rooms[0].latents().row(frame.row()).to_owned();
+            latent[2] += 0.1;
+            let latent = latent.view();
+            let one_by_one = localize(&rooms, latent, 20, &Cancellation::default()).unwrap();
+            let together = localize_jointly(&index, |room| &rooms[room], latent, 20);
+            assert_eq!(together, one_by_one, "{charts} charts");
+        }
+    }
+
+    let [one, other] = [1, 2].map(|charts| {
+        navigator(
+            &folder,
+            "synthetic",
+            Arc::new(adapter_of(&folder, "synthetic", charts)),
+        )
+    });
+    assert!(joint_index([&one, &other]).is_none());
+}
 
 /// Oracle: the definition, P(‖ΔP‖ < ε), which the oracle computed from the poses alone.
 fn identity_hits_exactly_when_the_motion_is_short(room: &str, folder: PathBuf) {

@@ -305,10 +305,10 @@ impl Map {
         self.index.memory_bytes() + by_appearance
     }
 
-    /// Distance of a view's latent from the nearest mapped frame, in standard deviations of frame noise; infinite
+    /// Distance of a whitened latent from the nearest mapped frame, in standard deviations of frame noise; infinite
     /// without mapped frames.
-    pub fn distance(&self, latent: ArrayView1<'_, f64>) -> f64 {
-        let nearest = self.index.nearest(&self.whitened(latent), 1, None);
+    pub(super) fn distance(&self, whitened: &[f64]) -> f64 {
+        let nearest = self.index.nearest(whitened, 1, None);
         nearest
             .first()
             .map_or(f64::INFINITY, |nearest| nearest.distance)
@@ -385,8 +385,13 @@ impl Map {
         frames.iter().map(of_latent).collect()
     }
 
+    /// The whitened latents of the mapped frames, in order, shape (m, k).
+    pub(super) fn whitened_latents(&self) -> Array2<f64> {
+        self.index.rows()
+    }
+
     /// Whitens a latent of shape (k,): the result is in standard deviations of frame noise.
-    fn whitened(&self, latent: ArrayView1<'_, f64>) -> Vec<f64> {
+    pub(super) fn whitened(&self, latent: ArrayView1<'_, f64>) -> Vec<f64> {
         let coordinates = latent.slice(s![..self.navigator.adapter().coordinate_count()]);
         self.error_model
             .frame_noise()

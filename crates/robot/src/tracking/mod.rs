@@ -24,7 +24,9 @@ pub use measured_pose::{Drift, MeasuredPose, OdometryDelta};
 pub use motion_prior::MotionPrior;
 pub(crate) use pose_with_covariance::PLACE_DEVIATION_M;
 pub use pose_with_covariance::PoseWithCovariance;
-pub use relocalize::{ROOM_RATIO, Relocalization, RoomMatch, relocalize};
+pub use relocalize::{
+    ROOM_RATIO, Relocalization, RoomMatch, joint_map_index, relocalize, relocalize_jointly,
+};
 pub use update::{BestMatch, Candidate, Refusal, Sensor, Status, Update};
 pub use view::{View, motion};
 

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use super::{Error, Map, MapMatch, MapQuery};
 use seese3_core::cancel::Cancellation;
+use seese3_core::index::{JointIndex, PartNeighbor};
 
 /// Ratio test between rooms: the distance to the best room must be at most this fraction of the
 /// distance to the second.
@@ -12,7 +13,7 @@ pub const ROOM_RATIO: f64 = 0.9;
 /// Rooms ranked by how well a camera's views match them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Relocalization {
-    /// The rooms, best match first.
+    /// The ranked rooms, best match first: all, or the best of a joint search.
     pub rooms: Vec<RoomMatch>,
     /// Match of the newest view with the best room.
     pub best: MapMatch,
@@ -43,28 +44,27 @@ pub struct RoomMatch {
 /// # Errors
 /// [`Error::NoMap`] without a map, [`Error::NoView`] without a view, [`Error::Adapters`] if the
 /// maps have different adapters, [`Error::Cancelled`] once `cancel` is set.
-pub fn relocalize(
-    maps: &[Arc<Map>],
+pub fn relocalize<M: AsRef<Map>>(
+    maps: &[M],
     views: &[MapQuery<'_>],
     cancel: &Cancellation,
 ) -> Result<Relocalization, Error> {
-    let adapter = maps.first().ok_or(Error::NoMap)?.navigator().adapter();
+    let first = maps.first().ok_or(Error::NoMap)?.as_ref();
     let newest = views.last().ok_or(Error::NoView)?;
-    if maps
+    check_adapters(maps)?;
+
+    // One adapter whitens alike in all rooms.
+    let whitened: Vec<Vec<f64>> = views
         .iter()
-        .any(|map| !Arc::ptr_eq(map.navigator().adapter(), adapter))
-    {
-        return Err(Error::Adapters);
-    }
+        .map(|view| first.whitened(view.latent))
+        .collect();
 
     let mut rooms = Vec::with_capacity(maps.len());
     for (place, map) in maps.iter().enumerate() {
         cancel.check().map_err(|_| Error::Cancelled)?;
-        let distance = views
-            .iter()
-            .map(|view| map.distance(view.latent))
-            .sum::<f64>();
-        let distance = distance / views.len() as f64;
+        let map = map.as_ref();
+        let distances = whitened.iter().map(|view| map.distance(view));
+        let distance = distances.sum::<f64>() / views.len() as f64;
         rooms.push(RoomMatch {
             map: place,
             distance,
@@ -74,11 +74,66 @@ pub fn relocalize(
 
     rooms.sort_by(|a, b| a.distance.total_cmp(&b.distance).then(a.map.cmp(&b.map)));
 
-    let matched = maps[rooms[0].map].match_view(*newest, 1);
+    let matched = maps[rooms[0].map].as_ref().match_view(*newest, 1);
     Ok(judged(rooms, matched))
 }
 
-/// Adds to ranked rooms whether the first one, which the newest view matches so, is ambiguous, and why.
+/// The index of the whitened latents of `maps` for [`relocalize_jointly`]; `None` if there are none, or too many.
+///
+/// # Errors
+/// [`Error::Adapters`] if the maps have different adapters.
+pub fn joint_map_index<M: AsRef<Map>>(maps: &[M]) -> Result<Option<JointIndex>, Error> {
+    check_adapters(maps)?;
+    let latents: Vec<_> = maps
+        .iter()
+        .map(|map| map.as_ref().whitened_latents())
+        .collect();
+    let latents: Vec<_> = latents.iter().map(|latents| latents.view()).collect();
+    Ok(JointIndex::of(&latents))
+}
+
+/// The answer of [`relocalize`] for one view in maps with this index, with the best `count` rooms of at least two.
+///
+/// # Errors
+/// [`Error::NoMap`] without a map.
+pub fn relocalize_jointly<M: AsRef<Map>>(
+    maps: &[M],
+    index: &JointIndex,
+    view: MapQuery<'_>,
+    count: usize,
+) -> Result<Relocalization, Error> {
+    let whitened = maps
+        .first()
+        .ok_or(Error::NoMap)?
+        .as_ref()
+        .whitened(view.latent);
+    let nearest = index.nearest_parts(&whitened, count.max(2));
+    let room = |found: &PartNeighbor| RoomMatch {
+        map: found.part,
+        distance: found.neighbor.distance,
+        out_of_distribution: maps[found.part]
+            .as_ref()
+            .out_of_distribution(found.neighbor.distance),
+    };
+    let rooms: Vec<RoomMatch> = nearest.iter().map(room).collect();
+    let best = rooms.first().ok_or(Error::NoMap)?;
+
+    let matched = maps[best.map].as_ref().match_view(view, 1);
+    Ok(judged(rooms, matched))
+}
+
+/// Checks that the maps have one adapter.
+fn check_adapters<M: AsRef<Map>>(maps: &[M]) -> Result<(), Error> {
+    let first = maps.first().ok_or(Error::NoMap)?.as_ref();
+    let adapter = first.navigator().adapter();
+    let has_other = |map: &M| !Arc::ptr_eq(map.as_ref().navigator().adapter(), adapter);
+    if maps.iter().any(has_other) {
+        return Err(Error::Adapters);
+    }
+    Ok(())
+}
+
+/// Judges whether the best room is ambiguous, given its match of the newest view.
 fn judged(rooms: Vec<RoomMatch>, matched: MapMatch) -> Relocalization {
     let best = &rooms[0];
     let margin = rooms

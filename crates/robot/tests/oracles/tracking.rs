@@ -5,6 +5,7 @@ use std::sync::Arc;
 use nalgebra::Translation3;
 use ndarray::Array1;
 use seese3_core::adapter::Adapter;
+use seese3_core::cancel::Cancellation;
 use seese3_core::features::Features;
 use seese3_core::geometry::{Pose, PoseError, body_twist, exp};
 use seese3_core::navigation::{IndexKind, Navigator};
@@ -15,7 +16,8 @@ use seese3_robot::pose_filter::{
     FilterParameters, FilterRoom, FilterState, PoseFilter, ViewObservation,
 };
 use seese3_robot::tracking::{
-    Drift, Map, MapQuery, MeasuredPose, PoseReader, PoseWithCovariance, Status, Update,
+    Drift, Map, MapQuery, MeasuredPose, PoseReader, PoseWithCovariance, Relocalization, Status,
+    Update, joint_map_index, relocalize, relocalize_jointly,
 };
 use seese3_testing::world::{FRAMES, calibrated, place, served};
 
@@ -609,4 +611,32 @@ fn a_map_of_tables_answers_as_the_first() {
         .slice(ndarray::s![1.., ..])
         .to_owned();
     assert!(again(other).is_none());
+}
+
+/// Oracle: the comparison of the view with one map after the other, of which the best are kept.
+#[test]
+fn maps_are_searched_together_as_one_by_one() {
+    let adapter = Arc::new(calibrated().0);
+    let maps: Vec<Arc<Map>> = (1..6)
+        .map(|seed| {
+            let (room, features) = place("hall", seed);
+            Arc::new(map(&adapter, room.poses().to_vec(), &features))
+        })
+        .collect();
+    let index = joint_map_index(&maps).unwrap().unwrap();
+
+    for (which, row) in [(0, 50), (3, 51), (4, 200)] {
+        let latent = maps[which].navigator().latents().row(row).to_owned();
+        let view = MapQuery::of_latent(latent.view());
+        let all = relocalize(&maps, &[view], &Cancellation::default()).unwrap();
+        for count in [1, 2, 4, 9] {
+            let found = relocalize_jointly(&maps, &index, view, count).unwrap();
+            let best = count.max(2).min(maps.len());
+            let expected = Relocalization {
+                rooms: all.rooms[..best].to_vec(),
+                ..all.clone()
+            };
+            assert_eq!(found, expected, "row {row} of map {which}");
+        }
+    }
 }

@@ -28,6 +28,7 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::futures::OwnedNotified;
 use tokio::sync::{AcquireError, Notify, OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinSet;
+use tokio::task::coop::unconstrained;
 use tokio_rustls::server::TlsStream;
 use tokio_stream::Stream;
 use tokio_stream::wrappers::ReceiverStream;
@@ -103,7 +104,8 @@ impl Closing {
     }
 }
 
-/// An open connection. Dropping it releases its permit.
+/// An open connection. Dropping it first removes its entry and then releases its place: a new connection would wait in
+/// vain for the place of an entry that has none any more.
 pub struct Connection {
     transport: Transport,
     /// The bytes read while the connection was opened; the cursor is how many tonic has read.
@@ -130,11 +132,27 @@ struct Opener {
     metrics: Metrics,
 }
 
+type AcquiredPlace = Result<OwnedSemaphorePermit, AcquireError>;
+
 /// The place of a new connection.
-enum Place<W> {
-    Free(Result<OwnedSemaphorePermit, AcquireError>),
-    /// That of a connection that is being closed.
-    Awaited(W),
+enum Place {
+    Free(AcquiredPlace),
+    /// That of a connection that is being closed. The first that waits gets it.
+    Awaited(Pin<Box<dyn Future<Output = AcquiredPlace> + Send>>),
+}
+
+impl Place {
+    /// A free place, or a place in the queue.
+    fn of(places: &Arc<Semaphore>) -> Self {
+        // When the cooperative budget of the task is used up, a poll returns Pending even though a place is free.
+        // Then another connection would be closed for it.
+        let mut place = Box::pin(unconstrained(places.clone().acquire_owned()));
+        let mut context = Context::from_waker(Waker::noop());
+        match place.as_mut().poll(&mut context) {
+            Poll::Ready(free) => Self::Free(free),
+            Poll::Pending => Self::Awaited(place),
+        }
+    }
 }
 
 /// How connections are accepted.
@@ -207,12 +225,7 @@ async fn accept_all(
         is_refused = false;
 
         // The place is waited for before a connection is closed, so that no later one gets it.
-        let mut place = Box::pin(opener.places.clone().acquire_owned());
-        let mut context = Context::from_waker(Waker::noop());
-        let place = match place.as_mut().poll(&mut context) {
-            Poll::Ready(free) => Place::Free(free),
-            Poll::Pending => Place::Awaited(place),
-        };
+        let place = Place::of(&opener.places);
         let is_awaited = matches!(place, Place::Awaited(_));
         if is_awaited {
             opener.metrics.shed(Full::Connections);
@@ -241,7 +254,7 @@ async fn accept_all(
                     Place::Awaited(place) => place.await,
                 };
                 let place = place.map_err(io::Error::other)?;
-                opener.open(tcp, peer, place).await
+                opener.open(tcp, place, peer).await
             };
             let connection = tokio::select! {
                 connection = tokio::time::timeout(OPENING, connection) => connection,
@@ -279,8 +292,9 @@ impl Opener {
     async fn open(
         &self,
         tcp: TcpStream,
-        mut peer: Peer,
+        // Dropped after the peer, see `Connection`.
         place: OwnedSemaphorePermit,
+        mut peer: Peer,
     ) -> io::Result<Connection> {
         tcp.set_nodelay(true)?;
 
@@ -309,6 +323,15 @@ impl Opener {
             peer,
             _place: place,
         })
+    }
+}
+
+impl Drop for Connection {
+    fn drop(&mut self) {
+        // Requests in progress may still hold the entry.
+        if let Some(entry) = &self.peer.entry {
+            entry.remove();
+        }
     }
 }
 
@@ -400,5 +423,114 @@ impl AsyncWrite for Connection {
             Transport::Plain(stream) => Pin::new(stream).poll_shutdown(context),
             Transport::Tls(stream) => Pin::new(stream).poll_shutdown(context),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Mutex;
+    use std::task::Wake;
+
+    use futures_util::FutureExt;
+    use tokio::task::coop::{consume_budget, has_budget_remaining};
+
+    use super::*;
+
+    /// Oracle: the contract: connections get places in the order of their arrival, and free places at once, also where
+    /// the task that accepts them has used up its budget.
+    #[tokio::test]
+    async fn places_are_given_in_the_order_of_arrival() {
+        let accept = tokio::spawn(async {
+            let places = Arc::new(Semaphore::new(1));
+            while has_budget_remaining() {
+                consume_budget().now_or_never();
+            }
+
+            let Place::Free(Ok(first)) = Place::of(&places) else {
+                panic!("one place is free");
+            };
+            let Place::Awaited(mut second) = Place::of(&places) else {
+                panic!("no place is free");
+            };
+            let Place::Awaited(mut third) = Place::of(&places) else {
+                panic!("no place is free");
+            };
+
+            drop(first);
+            assert!((&mut third).now_or_never().is_none());
+            let second = (&mut second).now_or_never();
+            assert!(matches!(second, Some(Ok(_))));
+            drop(second);
+            assert!(matches!(third.now_or_never(), Some(Ok(_))));
+        });
+        accept.await.unwrap();
+    }
+
+    /// Looks for an entry at the moment when a place becomes free.
+    struct AtRelease {
+        owners: Arc<Owners>,
+        had_entry: Mutex<Option<bool>>,
+    }
+
+    impl Wake for AtRelease {
+        fn wake(self: Arc<Self>) {
+            *self.had_entry.lock().unwrap() = Some(self.owners.close_oldest());
+        }
+    }
+
+    /// Whether the only entry is still there when the only place becomes free by `ends`, a connection that ends.
+    async fn has_entry_at_release<E: Future>(
+        ends: impl FnOnce(Opener, Peer, OwnedSemaphorePermit) -> E,
+    ) -> bool {
+        let owners = Owners::new(1);
+        let opener = Opener {
+            places: Arc::new(Semaphore::new(1)),
+            last_id: Arc::default(),
+            owners: Some(owners.clone()),
+            tls: None,
+            metrics: Metrics::default(),
+        };
+        let place = opener.places.clone().acquire_owned().await.unwrap();
+        let mut next = Box::pin(opener.places.clone().acquire_owned());
+        let waker = Arc::new(AtRelease {
+            owners,
+            had_entry: Mutex::default(),
+        });
+        let peer = opener.peer(([127, 0, 0, 1], 1).into());
+        let polled = next
+            .as_mut()
+            .poll(&mut Context::from_waker(&waker.clone().into()));
+        assert!(polled.is_pending());
+
+        ends(opener, peer, place).await;
+        waker.had_entry.lock().unwrap().expect("the place is free")
+    }
+
+    async fn sent(bytes: &[u8]) -> TcpStream {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let mut client = TcpStream::connect(listener.local_addr().unwrap())
+            .await
+            .unwrap();
+        tokio::io::AsyncWriteExt::write_all(&mut client, bytes)
+            .await
+            .unwrap();
+        listener.accept().await.unwrap().0
+    }
+
+    /// Oracle: the contract: the place of an entry that is closed becomes free afterwards, however the connection ends.
+    #[tokio::test]
+    async fn an_entry_ends_before_its_place() {
+        let fails = has_entry_at_release(|opener, peer, place| async move {
+            assert!(opener.open(sent(b"PRI").await, place, peer).await.is_err());
+        });
+        assert!(!fails.await);
+
+        let ends = has_entry_at_release(|opener, peer, place| async move {
+            let request = peer.clone();
+            let opened = opener.open(sent(&[0; PREFACE]).await, place, peer).await;
+            drop(opened.unwrap());
+            drop(request);
+        });
+        assert!(!ends.await);
     }
 }

@@ -183,14 +183,19 @@ impl Entry {
         let most = self.all.most;
         self.all.with(|state| state.assign(self.id, owner, most))
     }
-}
 
-impl Drop for Entry {
-    fn drop(&mut self) {
+    /// Removes the entry before it is dropped.
+    pub fn remove(&self) {
         self.all.with(|state| {
             state.unowned.remove(&self.id);
             state.remove(self.id);
         });
+    }
+}
+
+impl Drop for Entry {
+    fn drop(&mut self) {
+        self.remove();
     }
 }
 

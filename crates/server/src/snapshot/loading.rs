@@ -24,6 +24,7 @@ use super::cache::RoomCache;
 use super::loaded::Candidate;
 use super::pinned::PinnedRevisions;
 use super::room_loading::{Problem, RoomLoader, contained};
+use super::searches::Searches;
 use super::served::ServedRoom;
 use super::{Refusal, Snapshot};
 use seese3_core::features::FeatureSource;
@@ -180,6 +181,7 @@ impl Loader {
         let mut loaded = Snapshot {
             decoding: self.decoding.clone(),
             pinned: Some(self.pinned.clone()),
+            searches: Searches::new(self.memory.bytes.is_none()),
             ..Snapshot::default()
         };
 

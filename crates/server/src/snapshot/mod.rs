@@ -7,6 +7,7 @@ mod loading;
 mod room_loading;
 mod loaded;
 mod pinned;
+mod searches;
 mod served;
 
 pub use content::frames_content;
@@ -14,6 +15,8 @@ pub use loaded::{FittedReader, ServedKeypoints, ServedNavigator};
 pub use loading::{Loader, Refused, RoomMemory};
 use pinned::PinnedRevisions;
 use room_loading::Problem;
+use searches::Searches;
+pub use searches::{FoundRooms, Search, SearchedRooms, ServedRooms};
 pub use served::ServedRoom;
 
 use std::collections::BTreeMap;
@@ -87,6 +90,7 @@ pub struct Snapshot {
     refused: Refusals,
     /// Loads the revisions that requests state; `None` without a store.
     pinned: Option<Arc<PinnedRevisions>>,
+    searches: Searches,
 }
 
 impl Snapshot {
@@ -119,6 +123,7 @@ impl Snapshot {
             keypoint_encoders: self.keypoint_encoders.clone(),
             decoding: self.decoding.clone(),
             pinned: self.pinned.clone(),
+            searches: Searches::default(),
             refused: Refusals {
                 rooms: owned(refused_rooms.filter(|(name, _)| scope.contains(name))),
                 // An adapter may be named after its room.
@@ -138,6 +143,7 @@ impl Snapshot {
             decoding: self.decoding.clone(),
             refused: self.refused.clone(),
             pinned: self.pinned.clone(),
+            searches: Searches::default(),
         }
     }
 
@@ -248,6 +254,11 @@ impl Snapshot {
         let of_room = source.and_then(|source| self.keypoint_encoder(source));
         let any = self.keypoint_encoders.first();
         of_room.or_else(|| any.map(|(_, encoder)| encoder.as_ref()))
+    }
+
+    /// The rooms of searches that name none.
+    pub fn searches(&self) -> &Searches {
+        &self.searches
     }
 
     /// Number of rooms.

@@ -7,7 +7,7 @@ use nalgebra::Matrix6;
 use super::super::Error;
 use super::super::convert::{self, ImageCamera};
 use super::super::relocalization::rooms_to_track_in;
-use super::super::snapshot::{ServedNavigator, Snapshot};
+use super::super::snapshot::{ServedNavigator, ServedRooms, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::{CameraIntrinsics, Pose, adjoint};
 use seese3_robot::pose_filter::FilterParameters;
@@ -38,7 +38,7 @@ pub fn rooms(
     snapshot: &Snapshot,
     config: &pb::TrackConfig,
 ) -> Result<Vec<Arc<ServedNavigator>>, Error> {
-    let mut served = named_rooms(snapshot, config)?;
+    let mut served = named_rooms(snapshot, config)?.to_vec();
     let camera = config.camera.as_ref();
     let camera = camera.map(|camera| convert::image_camera("camera", camera));
     if let Some(ImageCamera::Stated(camera)) = camera.transpose()? {
@@ -55,10 +55,7 @@ pub fn rooms(
     Ok(served)
 }
 
-fn named_rooms(
-    snapshot: &Snapshot,
-    config: &pb::TrackConfig,
-) -> Result<Vec<Arc<ServedNavigator>>, Error> {
+fn named_rooms(snapshot: &Snapshot, config: &pb::TrackConfig) -> Result<ServedRooms, Error> {
     // A single room becomes a list of one; errors on `rooms[0]` are renamed to the field `room`.
     match (config.room.as_str(), config.rooms.as_slice()) {
         ("", rooms) => rooms_to_track_in(snapshot, rooms, &config.adapter),

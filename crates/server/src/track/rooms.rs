@@ -138,11 +138,11 @@ pub fn rooms_with_keypoints(
         Error::NotFound { .. } if !config.room.is_empty() => error.named("room"),
         other => other,
     })?;
-    let is_usable = |room: &&Arc<ServedRoom>| {
+    let is_usable = |room: &&&Arc<ServedRoom>| {
         let source = room.summary.keypoints.as_ref();
         source.is_some_and(|source| snapshot.keypoint_encoder(source).is_some())
     };
-    let usable: Vec<&Arc<ServedRoom>> = asked.iter().filter(is_usable).collect();
+    let usable: Vec<&Arc<ServedRoom>> = asked.iter().filter(is_usable).copied().collect();
     if usable.is_empty() || (!named.is_empty() && usable.len() < asked.len()) {
         return Ok(None);
     }

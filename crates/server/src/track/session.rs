@@ -154,7 +154,7 @@ impl Session {
             Some(rooms) => (rooms, None),
             None => {
                 let served = rooms(snapshot, &config)?;
-                let maps = maps(&served)?;
+                let maps = maps(&served)?.into_iter().cloned().collect();
                 let rooms = served.into_iter().map(TrackedRoom::under).collect();
                 (rooms, Some(maps))
             }

@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 
+use prost::Message as _;
 use seese3_client::convert;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::track_request::Message;
@@ -751,6 +752,47 @@ async fn a_view_is_found_among_rooms_or_called_ambiguous() {
         spoil(&mut request);
         let error = server.client.relocalize(request).await.unwrap_err();
         assert_eq!(error.field().as_deref(), Some(field), "{error}");
+    }
+}
+
+/// Oracle: searches of the same rooms by name, which compare the view with one room after the other.
+#[tokio::test]
+async fn a_search_of_all_rooms_answers_as_one_of_each() {
+    let server = server(KEY).await;
+    let rooms = server.client.rooms().await.unwrap();
+    let names: Vec<String> = rooms.into_iter().map(|room| room.name).collect();
+    let named = |all: &pb::RelocalizeRequest| pb::RelocalizeRequest {
+        rooms: names.clone(),
+        ..all.clone()
+    };
+    let as_wire = |found: pb::RelocalizeResponse| (found.encode_to_vec(), found.room_count);
+
+    for (room, row) in [("hall", 50), ("attic", 250), ("attic", 12)] {
+        let view = feature(served(room).1.rows().row(row).to_vec()).unwrap();
+        for (views, max_rooms) in [(1, 1), (1, 2), (2, 2)] {
+            let all = pb::RelocalizeRequest {
+                views: vec![view.clone(); views],
+                max_rooms: Some(max_rooms),
+                top_k: Some(3),
+                ..Default::default()
+            };
+            let one_by_one = server.client.relocalize(named(&all)).await.unwrap();
+            let together = server.client.relocalize(all).await.unwrap();
+            assert_eq!(as_wire(together), as_wire(one_by_one));
+        }
+
+        let all = pb::LocalizeRequest {
+            view: Some(view),
+            top_k: Some(20),
+            ..Default::default()
+        };
+        let one_by_one = pb::LocalizeRequest {
+            rooms: names.clone(),
+            ..all.clone()
+        };
+        let one_by_one = server.client.localize(one_by_one).await.unwrap();
+        let together = server.client.localize(all).await.unwrap();
+        assert_eq!(together.encode_to_vec(), one_by_one.encode_to_vec());
     }
 }
 

@@ -23,6 +23,8 @@ pub struct Dying<S> {
     writes: Arc<AtomicUsize>,
     /// Files can still be removed and get other names.
     only_full: bool,
+    /// Conditions of writes are ignored.
+    ignores_conditions: bool,
 }
 
 impl<S> Dying<S> {
@@ -32,6 +34,15 @@ impl<S> Dying<S> {
             survives,
             writes: Arc::default(),
             only_full: false,
+            ignores_conditions: false,
+        }
+    }
+
+    /// A server that replaces objects even on the condition that there is none.
+    pub fn unconditional(inner: S) -> Self {
+        Self {
+            ignores_conditions: true,
+            ..Self::new(inner, usize::MAX)
         }
     }
 
@@ -68,6 +79,10 @@ impl<S: ObjectStore> ObjectStore for Dying<S> {
         if self.writes.fetch_add(1, Ordering::Relaxed) >= self.survives {
             return Err(killed());
         }
+        let opts = match self.ignores_conditions {
+            true => PutOptions::default(),
+            false => opts,
+        };
         self.inner.put_opts(location, payload, opts).await
     }
 

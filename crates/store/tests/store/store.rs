@@ -9,7 +9,7 @@ use seese3_core::features::{FeatureSource, Features};
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_core::splits::{Split, StrideRange};
 use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
-use seese3_store::{Error, Store};
+use seese3_store::{Error, GarbagePolicy, Publishers, Store};
 use seese3_testing::recording::{adapter, room, set};
 
 pub async fn stored() -> (tempfile::TempDir, Store) {
@@ -542,4 +542,48 @@ fn a_bucket_is_opened_or_the_error_names_the_feature() {
         let error = opened.unwrap_err().to_string();
         assert!(error.contains("--features cloud"), "{error}");
     }
+}
+
+/// Oracle: the contract: a server that ignores If-None-Match gets no revision, and is named.
+#[tokio::test]
+async fn a_bucket_that_ignores_conditions_is_refused() {
+    let ignoring = crate::dying::Dying::unconditional(object_store::memory::InMemory::new());
+    let objects: std::sync::Arc<dyn object_store::ObjectStore> = std::sync::Arc::new(ignoring);
+    let store = Store::with_objects(objects.clone(), "s3://ignoring").with_write_check();
+    for _ in 0..2 {
+        let refused = store.publish_room(&room("a"), &[set("f", 1.0)]).await;
+        assert!(
+            matches!(refused, Err(Error::NotConditional { .. })),
+            "{refused:?}"
+        );
+    }
+    assert!(
+        store
+            .check_writable()
+            .await
+            .unwrap_err()
+            .to_string()
+            .contains("If-None-Match")
+    );
+    assert!(store.rooms().await.unwrap().is_empty());
+
+    // Nothing is left of what it was tried with.
+    let everything = GarbagePolicy {
+        older_than: std::time::Duration::ZERO,
+        publishers: Publishers::None,
+    };
+    let plain = Store::with_objects(objects, "s3://ignoring");
+    let left = plain.find_garbage(everything).await.unwrap().files;
+    assert!(
+        left.iter().all(|file| !file.path.contains("probe")),
+        "{left:?}"
+    );
+
+    let honoring = std::sync::Arc::new(object_store::memory::InMemory::new());
+    let store = Store::with_objects(honoring, "memory").with_write_check();
+    let published = store
+        .publish_room(&room("a"), &[set("f", 1.0)])
+        .await
+        .unwrap();
+    assert_eq!(published.revision, 1);
 }
