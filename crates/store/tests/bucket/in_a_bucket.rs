@@ -126,14 +126,16 @@ async fn publishes_until_it_is_killed() {
     let (url, variables): (String, Vec<(String, String)>) =
         serde_json::from_str(&settings).unwrap();
     let store = Store::open_with(&url, &variables).unwrap();
-    // On a line of its own.
-    println!("\nready");
     for number in 0.. {
         let name = format!("f-{}-{number}", std::process::id());
         store
             .publish_room(&room("a"), &[set(&name, 1.0)])
             .await
             .unwrap();
+        if number == 0 {
+            // On a line of its own.
+            println!("\nready");
+        }
     }
 }
 
@@ -177,15 +179,11 @@ async fn a_killed_publisher_leaves_a_whole_store() {
             stored.revision,
             "round {round}"
         );
-        assert!(stored.revision >= revision);
+        assert!(stored.revision > revision, "round {round}");
         revision = stored.revision;
         store.collect_garbage(ALL_GARBAGE).await.unwrap();
         assert_eq!(store.verify(&|_| ()).await.unwrap(), [], "round {round}");
     }
-    assert!(
-        revision > 1,
-        "no publication was completed between the kills"
-    );
 }
 
 /// Oracle: the bytes in the bucket: what was read once is read again without the server's objects, unless the cached
