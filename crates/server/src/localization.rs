@@ -596,7 +596,7 @@ pub(super) fn rooms_under(
     Ok(Arc::new(SearchedRooms::new(found.rooms)))
 }
 
-/// As [`rooms_under`], looked up anew.
+/// Uncached [`rooms_under`].
 ///
 /// # Errors
 /// As [`rooms_under`].

@@ -347,7 +347,7 @@ pub fn rooms_to_track_in(
     Ok(Arc::new(SearchedRooms::new(found.rooms)))
 }
 
-/// As [`rooms_to_track_in`], looked up anew.
+/// Uncached [`rooms_to_track_in`].
 fn found_rooms_to_track_in(
     snapshot: &Snapshot,
     rooms: &[String],
