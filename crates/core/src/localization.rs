@@ -1,7 +1,8 @@
 //! Place recognition: the frames nearest to a view, in one or several rooms, by latent distance.
 //!
 //! Latent distances are comparable only under one adapter, so all rooms of a query must use the
-//! same adapter. [`localize_jointly`] gives the answers of [`localize`] from one index of all rooms.
+//! same adapter. [`localize_jointly`] gives the answers of [`localize`] from one index of all
+//! rooms.
 
 use std::sync::Arc;
 
@@ -64,8 +65,8 @@ pub fn localize<'a>(
     Ok(places)
 }
 
-/// The index of the latents of `rooms` for [`localize_jointly`]; `None` if there are none or too many, or if they have
-/// different adapters.
+/// The index of the latents of `rooms` for [`localize_jointly`]; `None` if there are none or too
+/// many, or if they have different adapters.
 pub fn joint_index<'a>(rooms: impl IntoIterator<Item = &'a Navigator>) -> Option<JointIndex> {
     let rooms: Vec<&Navigator> = rooms.into_iter().collect();
     let adapter = rooms.first()?.adapter();
@@ -82,8 +83,8 @@ pub fn joint_index<'a>(rooms: impl IntoIterator<Item = &'a Navigator>) -> Option
     JointIndex::of(&latents.collect::<Vec<_>>())
 }
 
-/// Same result as [`localize`], searched in the joint index of the rooms in the order of their names; `k` is at least
-/// 1. `navigator` is the room at a position.
+/// Same result as [`localize`], searched in the joint index of the rooms in the order of their
+/// names; `k` is at least 1. `navigator` is the room at a position.
 pub fn localize_jointly<'a>(
     index: &JointIndex,
     navigator: impl Fn(usize) -> &'a Navigator,

@@ -301,7 +301,7 @@ impl ComparedView {
         })?;
 
         let navigators = || served.iter().map(|served| served.navigator.as_ref());
-        let joint = served.joint(k, |rooms| {
+        let joint = served.joint(1, |rooms| {
             joint_index(rooms.iter().map(|served| served.navigator.as_ref()))
         });
         let latent = start.latent.view();

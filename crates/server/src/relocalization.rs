@@ -101,8 +101,8 @@ fn answer(
         None => RoomMatches::default(),
     };
 
-    // Then compare latents. Without them, keypoints still answer. The distances of rooms that keypoints locate are
-    // shown regardless of their rank.
+    // Then compare latents. Without them, keypoints still answer. The distances of rooms that
+    // keypoints locate are shown regardless of their rank.
     let wanted = matches.rooms().next().is_none().then_some(shown);
     let compared = rooms_to_track_in(snapshot, &rooms, &adapter)
         .and_then(|served| ByLatent::of(served, views, snapshot, wanted, cancel));
@@ -132,7 +132,8 @@ struct ByLatent {
 }
 
 impl ByLatent {
-    /// Compares the views with all rooms, and ranks them; only the best `wanted` rooms if it is given.
+    /// Compares the views with all rooms, and ranks them; only the best `wanted` rooms if it is
+    /// given.
     fn of(
         served: ServedRooms,
         views: Vec<pb::View>,

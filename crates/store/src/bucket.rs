@@ -46,8 +46,8 @@ mod cloud {
 
     use super::Variables;
 
-    /// Time from a request's start after which it is not repeated: one that timed out is repeated once. The pauses are
-    /// random, from 0.1 s on.
+    /// Time from a request's start after which it is not repeated: one that timed out is repeated
+    /// once. The pauses are random, from 0.1 s on.
     const RETRIED: Duration = Duration::from_secs(90);
     /// Not reached: a request that fails at once is repeated about 100 times in that time.
     const REPETITIONS: usize = 10_000;
@@ -97,7 +97,8 @@ mod cloud {
         Ok((objects, prefix))
     }
 
-    /// The settings of a provider among some variables, by the beginnings of their names in lower case.
+    /// The settings of a provider among some variables, by the beginnings of their names in lower
+    /// case.
     fn known<K: FromStr>(
         variables: &Variables,
         beginnings: &[&str],

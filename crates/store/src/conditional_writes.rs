@@ -1,8 +1,8 @@
 //! Verifies that the server of a bucket supports conditional writes.
 //!
-//! A manifest is written with `If-None-Match: *`, which fails if its revision number exists. So two publishers take
-//! different numbers. A server that ignores the header would overwrite the first manifest. If-Match is not used: a change
-//! of the defaults is a new numbered file too.
+//! A manifest is written with `If-None-Match: *`, which fails if its revision number exists. So two
+//! publishers take different numbers. A server that ignores the header would overwrite the first
+//! manifest. If-Match is not used: a change of the defaults is a new numbered file too.
 
 use object_store::path::Path;
 use object_store::{ObjectStoreExt, PutMode, PutOptions, PutPayload};
@@ -10,12 +10,12 @@ use object_store::{ObjectStoreExt, PutMode, PutOptions, PutPayload};
 use super::{Error, Store};
 
 impl Store {
-    /// Verifies once that the server supports If-None-Match, with a temporary object. Always succeeds for a store that was
-    /// opened as a folder.
+    /// Verifies once that the server supports If-None-Match, with a temporary object. Always
+    /// succeeds for a store that was opened as a folder.
     ///
     /// # Errors
-    /// [`Error::NotConditional`] if the server ignores or rejects the header, [`Error::Io`] if the bucket cannot be
-    /// written.
+    /// [`Error::NotConditional`] if the server ignores or rejects the header, [`Error::Io`] if the
+    /// bucket cannot be written.
     pub async fn check_conditional_writes(&self) -> Result<(), Error> {
         match &self.is_conditional {
             Some(known) => known

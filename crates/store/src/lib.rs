@@ -296,7 +296,8 @@ pub struct Store {
     quotas: Arc<Quotas>,
     /// Objects that were read before.
     cache: Option<Arc<ObjectCache>>,
-    /// Set once the server was seen to support conditional writes; `None` for a store opened as a folder.
+    /// Set once the server was seen to support conditional writes; `None` for a store opened as a
+    /// folder.
     is_conditional: Option<Arc<OnceCell<()>>>,
 }
 
@@ -329,7 +330,8 @@ impl Store {
     /// that compute for minutes before they publish.
     ///
     /// # Errors
-    /// [`Error::ReadOnly`] if it cannot be written; in a bucket also as [`Store::check_conditional_writes`].
+    /// [`Error::ReadOnly`] if it cannot be written; in a bucket also as
+    /// [`Store::check_conditional_writes`].
     pub async fn check_writable(&self) -> Result<(), Error> {
         let since = std::time::UNIX_EPOCH.elapsed().unwrap_or_default();
         let probe = format!("probe-{}-{}", std::process::id(), since.as_nanos());
@@ -359,8 +361,8 @@ impl Store {
         )
     }
 
-    /// As [`Store::open`], where `variables` stand for the environment, from which the settings of a bucket are read:
-    /// names and values.
+    /// As [`Store::open`], where `variables` stand for the environment, from which the settings of
+    /// a bucket are read: names and values.
     ///
     /// # Errors
     /// As [`Store::open`].
@@ -414,7 +416,8 @@ impl Store {
         }
     }
 
-    /// The same store, which verifies the server's support for conditional writes before the first one.
+    /// The same store, which verifies the server's support for conditional writes before the first
+    /// one.
     pub fn with_write_check(self) -> Self {
         Self {
             is_conditional: Some(Arc::default()),

@@ -1,7 +1,8 @@
 //! A cache of objects on the local disk, for stores in a bucket.
 //!
-//! The files are named after the SHA-256 of their content, and are compared with it whenever they are read. So a file
-//! that was altered is fetched again, and several processes may share the folder.
+//! The files are named after the SHA-256 of their content, and are compared with it whenever they
+//! are read. So a file that was altered is fetched again, and several processes may share the
+//! folder.
 
 use std::fs::{self, File};
 use std::io;
@@ -89,8 +90,8 @@ impl ObjectCache {
         Some(bytes)
     }
 
-    /// Keeps an object of this SHA-256. Least recently used objects are evicted if necessary. An object larger than the
-    /// cache is not kept.
+    /// Keeps an object of this SHA-256. Least recently used objects are evicted if necessary. An
+    /// object larger than the cache is not kept.
     pub(super) fn put(&self, hash: &str, bytes: &[u8]) -> Result<(), Cause> {
         if !is_hash(hash) || bytes.len() as u64 > self.most_bytes {
             return Ok(());
@@ -113,8 +114,8 @@ impl ObjectCache {
         Ok(written?)
     }
 
-    /// Evicts files until `bytes` more fit. The files are listed again after this process has written a part of the
-    /// limit, because others may write too.
+    /// Evicts files until `bytes` more fit. The files are listed again after this process has
+    /// written a part of the limit, because others may write too.
     fn make_room(&self, bytes: u64) -> io::Result<()> {
         let mut held = self.held.lock().unwrap_or_else(PoisonError::into_inner);
         held.written += bytes;
@@ -199,7 +200,8 @@ mod tests {
         assert!(folder.path().join("notes").exists());
     }
 
-    /// Oracle: the bound: those used last remain; files that are not the cache's own are left alone.
+    /// Oracle: the bound: those used last remain; files that are not the cache's own are left
+    /// alone.
     #[test]
     fn the_objects_used_last_remain() {
         let folder = tempfile::tempdir().unwrap();

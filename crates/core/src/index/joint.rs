@@ -5,7 +5,8 @@ use ndarray::{Array2, ArrayView2, Axis};
 use super::{Collector, ExactIndex, Index, Neighbor};
 use crate::room::FrameId;
 
-/// The latents of several parts, such as rooms, in one index. Faster than one index per part, with the same results.
+/// The latents of several parts, such as rooms, in one index. Faster than one index per part, with
+/// the same results.
 #[derive(Debug, Clone)]
 pub struct JointIndex {
     /// The first row of each part, and the number of rows.
@@ -23,8 +24,8 @@ pub struct PartNeighbor {
 }
 
 impl JointIndex {
-    /// Indexes the rows of each part, of shape (n, k) with the same k. `None` without a part, with parts of different
-    /// widths, or with more than 2³² − 1 rows.
+    /// Indexes the rows of each part, of shape (n, k) with the same k. `None` without a part, with
+    /// parts of different widths, or with more than 2³² − 1 rows.
     pub fn of(parts: &[ArrayView2<'_, f64>]) -> Option<Self> {
         let mut starts = vec![0_u32];
         for part in parts {

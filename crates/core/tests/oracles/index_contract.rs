@@ -162,8 +162,8 @@ fn by_definition(
 }
 
 proptest! {
-    /// Oracle: the definition, in f64: frames, their order and distances are equal to the bit, among
-    /// duplicates, near ties, far from zero, and where f32 overflows or underflows.
+    /// Oracle: the definition, in f64: frames, their order and distances are equal to the bit,
+    /// among duplicates, near ties, far from zero, and where f32 overflows or underflows.
     #[test]
     fn the_exact_index_answers_as_a_scan_in_f64(
         seed in 0_u64..1_000,
@@ -314,8 +314,8 @@ fn parts(seed: u64, count: usize) -> (Vec<Array2<f64>>, Vec<Vec<f64>>) {
 }
 
 proptest! {
-    /// Oracle: the definition: all rows of all parts by distance, then by part, then by row; the nearest parts are
-    /// those of the first row of each in that order.
+    /// Oracle: the definition: all rows of all parts by distance, then by part, then by row; the
+    /// nearest parts are those of the first row of each in that order.
     #[test]
     fn a_joint_index_answers_as_its_parts(seed in 0_u64..1_000, count in 1_usize..60, k in 1_usize..50) {
         let (parts, queries) = parts(seed, count);

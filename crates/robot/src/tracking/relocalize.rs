@@ -38,8 +38,8 @@ pub struct RoomMatch {
     pub out_of_distribution: f64,
 }
 
-/// Ranks rooms by one or more views, newest last; the camera must hardly move between them. In each room only the
-/// nearest latent of each view is searched; the best room is matched in full.
+/// Ranks rooms by one or more views, newest last; the camera must hardly move between them. In each
+/// room only the nearest latent of each view is searched; the best room is matched in full.
 ///
 /// # Errors
 /// [`Error::NoMap`] without a map, [`Error::NoView`] without a view, [`Error::Adapters`] if the
@@ -78,7 +78,8 @@ pub fn relocalize<M: AsRef<Map>>(
     Ok(judged(rooms, matched))
 }
 
-/// The index of the whitened latents of `maps` for [`relocalize_jointly`]; `None` if there are none, or too many.
+/// The index of the whitened latents of `maps` for [`relocalize_jointly`]; `None` if there are
+/// none, or too many.
 ///
 /// # Errors
 /// [`Error::Adapters`] if the maps have different adapters.
@@ -92,7 +93,8 @@ pub fn joint_map_index<M: AsRef<Map>>(maps: &[M]) -> Result<Option<JointIndex>, 
     Ok(JointIndex::of(&latents))
 }
 
-/// The answer of [`relocalize`] for one view in maps with this index, with the best `count` rooms of at least two.
+/// The answer of [`relocalize`] for one view in maps with this index, with the best `count` rooms
+/// of at least two.
 ///
 /// # Errors
 /// [`Error::NoMap`] without a map.

@@ -104,8 +104,8 @@ impl Closing {
     }
 }
 
-/// An open connection. Dropping it first removes its entry and then releases its place: a new connection would wait in
-/// vain for the place of an entry that has none any more.
+/// An open connection. Dropping it first removes its entry and then releases its place: a new
+/// connection would wait in vain for the place of an entry that has none any more.
 pub struct Connection {
     transport: Transport,
     /// The bytes read while the connection was opened; the cursor is how many tonic has read.
@@ -144,8 +144,8 @@ enum Place {
 impl Place {
     /// A free place, or a place in the queue.
     fn of(places: &Arc<Semaphore>) -> Self {
-        // When the cooperative budget of the task is used up, a poll returns Pending even though a place is free.
-        // Then another connection would be closed for it.
+        // When the cooperative budget of the task is used up, a poll returns Pending even though a
+        // place is free. Then another connection would be closed for it.
         let mut place = Box::pin(unconstrained(places.clone().acquire_owned()));
         let mut context = Context::from_waker(Waker::noop());
         match place.as_mut().poll(&mut context) {
@@ -436,8 +436,8 @@ mod tests {
 
     use super::*;
 
-    /// Oracle: the contract: connections get places in the order of their arrival, and free places at once, also where
-    /// the task that accepts them has used up its budget.
+    /// Oracle: the contract: connections get places in the order of their arrival, and free places
+    /// at once, also where the task that accepts them has used up its budget.
     #[tokio::test]
     async fn places_are_given_in_the_order_of_arrival() {
         let accept = tokio::spawn(async {
@@ -478,7 +478,8 @@ mod tests {
         }
     }
 
-    /// Whether the only entry is still there when the only place becomes free by `ends`, a connection that ends.
+    /// Whether the only entry is still there when the only place becomes free by `ends`, a
+    /// connection that ends.
     async fn has_entry_at_release<E: Future>(
         ends: impl FnOnce(Opener, Peer, OwnedSemaphorePermit) -> E,
     ) -> bool {
@@ -517,7 +518,8 @@ mod tests {
         listener.accept().await.unwrap().0
     }
 
-    /// Oracle: the contract: the place of an entry that is closed becomes free afterwards, however the connection ends.
+    /// Oracle: the contract: the place of an entry that is closed becomes free afterwards, however
+    /// the connection ends.
     #[tokio::test]
     async fn an_entry_ends_before_its_place() {
         let fails = has_entry_at_release(|opener, peer, place| async move {

@@ -1,7 +1,8 @@
-//! Room lists of requests that name no room, cached per snapshot, with one index of all their latents.
+//! Room lists of requests that name no room, cached per snapshot, with one index of all their
+//! latents.
 //!
-//! Finding the rooms takes some microseconds each, longer than comparing a view with a small room. With a memory
-//! limit nothing is cached, because that would keep the rooms in memory.
+//! Finding the rooms takes some microseconds each, longer than comparing a view with a small room.
+//! With a memory limit nothing is cached, because that would keep the rooms in memory.
 
 use std::collections::BTreeMap;
 use std::ops::Deref;
@@ -48,8 +49,8 @@ impl SearchedRooms {
         self.is_exact
     }
 
-    /// The index of all rooms for a search of the nearest `count` rooms or frames. `None` where it would save nothing,
-    /// and while `make` makes it, on a thread of its own.
+    /// The index of all rooms, for a search of the nearest `count` of them. `None` where it would
+    /// save nothing, and while `make` makes it, on a thread of its own.
     pub fn joint(
         self: &Arc<Self>,
         count: usize,
@@ -93,7 +94,8 @@ pub enum Search {
 /// The rooms of a search.
 pub struct FoundRooms {
     pub rooms: Vec<Arc<ServedNavigator>>,
-    /// Whether the next search would find the same rooms. A room that cannot be read may be readable then.
+    /// Whether the next search would find the same rooms. A room that cannot be read may be
+    /// readable then.
     pub is_final: bool,
 }
 
@@ -132,8 +134,8 @@ impl Searches {
         if let Some(known) = self.found().get(&key) {
             return Ok(known.clone());
         }
-        // Without the lock: rooms may be read from the store. There are at most two entries for each adapter and two
-        // for no adapter, because `find` fails for an unknown name.
+        // Without the lock: rooms may be read from the store. There are at most two entries for
+        // each adapter and two for no adapter, because `find` fails for an unknown name.
         let FoundRooms { rooms, is_final } = find()?;
         let mut rooms = SearchedRooms::new(rooms);
         if !is_final {
@@ -173,7 +175,8 @@ mod tests {
         Ok(FoundRooms { rooms, is_final })
     }
 
-    /// Oracle: the contract: rooms are found once for each adapter and use, if the next search would find the same.
+    /// Oracle: the contract: rooms are found once for each adapter and use, if the next search
+    /// would find the same.
     #[test]
     fn final_searches_are_kept() {
         let searches = Searches::new(true);

@@ -78,7 +78,8 @@ async fn a_bucket_keeps_what_a_folder_keeps() {
     assert!(seaweed.store("second").rooms().await.unwrap().is_empty());
 }
 
-/// Oracle: the contract: of two publishers at once, neither loses its work, and the default is that of one of them.
+/// Oracle: the contract: of two publishers at once, neither loses its work, and the default is that
+/// of one of them.
 #[tokio::test(flavor = "multi_thread")]
 #[ignore = "needs SeaweedFS: SEESE3_WEED"]
 async fn two_publishers_lose_nothing() {
@@ -116,7 +117,8 @@ async fn two_publishers_lose_nothing() {
     assert_eq!(stores[0].verify(&|_| ()).await.unwrap(), []);
 }
 
-/// A publisher for `a_killed_publisher_leaves_a_whole_store`, which runs it as a process of its own.
+/// A publisher for `a_killed_publisher_leaves_a_whole_store`, which runs it as a process of its
+/// own.
 #[tokio::test]
 #[ignore = "is part of another test"]
 async fn publishes_until_it_is_killed() {
@@ -139,8 +141,8 @@ async fn publishes_until_it_is_killed() {
     }
 }
 
-/// Oracle: the contract: after a kill at any time there is an old or a new revision, and the store is clean after garbage
-/// collection.
+/// Oracle: the contract: after a kill at any time there is an old or a new revision, and the store
+/// is clean after garbage collection.
 #[tokio::test(flavor = "multi_thread")]
 #[ignore = "needs SeaweedFS: SEESE3_WEED"]
 async fn a_killed_publisher_leaves_a_whole_store() {
@@ -186,8 +188,8 @@ async fn a_killed_publisher_leaves_a_whole_store() {
     }
 }
 
-/// Oracle: the bytes in the bucket: what was read once is read again without the server's objects, unless the cached
-/// file was altered.
+/// Oracle: the bytes in the bucket: what was read once is read again without the server's objects,
+/// unless the cached file was altered.
 #[tokio::test(flavor = "multi_thread")]
 #[ignore = "needs SeaweedFS: SEESE3_WEED"]
 async fn objects_are_read_from_the_cache() {
@@ -226,7 +228,8 @@ async fn objects_are_read_from_the_cache() {
     assert!(matches!(missing, Err(Error::Absent { .. })), "{missing:?}");
 }
 
-/// Oracle: the contract: the store that stops and comes back is read and written again by the same process.
+/// Oracle: the contract: the store that stops and comes back is read and written again by the same
+/// process.
 #[tokio::test(flavor = "multi_thread")]
 #[ignore = "needs SeaweedFS: SEESE3_WEED"]
 async fn a_store_that_comes_back_is_used_again() {

@@ -182,7 +182,8 @@ fn run(program: &Path, folder: &Path, [master, volume, filer, s3]: [u16; 4]) -> 
         .unwrap()
 }
 
-/// Ports that are free now, below those that the system gives away. Each server also listens at its port + 10,000.
+/// Ports that are free now, below those that the system gives away. Each server also listens at its
+/// port + 10,000.
 fn free_ports() -> [u16; 4] {
     let mut ports = (11_000..20_000).filter(|port| {
         let is_free = |port: u16| TcpListener::bind(("127.0.0.1", port)).is_ok();
